@@ -14,7 +14,8 @@ namespace lodestone {
 enum class ExrCompression : std::uint8_t { kNone, kZip, kPiz, kPxr24 };
 enum class ExrPixel : std::uint8_t { kFloat, kHalf };
 
-// Attributes written into the header, besides the required ones.
+// Attributes written into the header, besides the required ones: strings `layer recipe revision seed tile crs unit datum`, v2d
+// `origin spacing`, v2f `height_range`. No text holds a NUL.
 struct TileAttributes {
   std::string layer, recipe, revision, crs, unit = "metre", datum;
   std::uint64_t seed = 0;       // written as a decimal string
@@ -31,6 +32,8 @@ struct ExrOptions {
 };
 
 // heights_m: posts * posts. provenance: empty, or posts * posts of 0, 1, 2 (adds the channel).
+// none, zip and piz keep every bit; pxr24 keeps 16 significant bits of a float: lossless only for quantised heights (quantum.h).
+// half rounds to nearest even. Errors: kInvalidArgument (sizes, provenance over 2, half height beyond 65504 m), kInternal.
 Result<std::string> encode_exr_tile(std::span<const float> heights_m, std::span<const std::uint8_t> provenance, int posts,
                                     const TileAttributes& attributes, const ExrOptions& options);
 
