@@ -29,12 +29,14 @@ class DiskCache {
     bool is_writable = false;       // false while the disk refuses; retried every few seconds
     std::string last_error;
   };
-  // Never fails for a bad directory: then the cache is open but not writable, with last_error set, and keeps retrying.
+  // Takes the directory for itself (cache.lock in it); a damaged file is thrown away and counted in `corrupt`.
+  // Never fails for a bad directory, nor for one that another process has: then the cache is open but not writable, with last_error set, and keeps retrying.
   static std::unique_ptr<DiskCache> open(const DiskCacheOptions& options);
   virtual ~DiskCache() = default;  // drains the queue
   // tag: groups entries for purge_tag, e.g. "layer" or "layer/recipe".
   virtual CachedTilePtr get(const CacheKey& key) = 0;
-  virtual void put(const CacheKey& key, const std::string& tag, CachedTilePtr tile) = 0;  // queued; group commit
+  // Queued; group commit. Dropped and counted: more than an eighth of the budget, tags over 1000 bytes, a full queue, a refusing disk.
+  virtual void put(const CacheKey& key, const std::string& tag, CachedTilePtr tile) = 0;
   virtual void flush() = 0;  // waits until everything queued before is committed (or refused)
   // Removes entries whose tag equals `tag` or starts with `tag` + "/"; empty: all. Gives the number removed.
   virtual Result<std::uint64_t> purge(const std::string& tag) = 0;
@@ -45,7 +47,8 @@ struct DiskCacheReport {
   std::uint64_t entries = 0, bytes = 0;
   std::uint64_t corrupt = 0;  // removed when `repair`
 };
-// Checks every entry. Errors: kNotFound (no cache there), kIo.
+// Checks every entry. Errors: kNotFound (no cache there), kConflict (a running daemon has it open), kIo.
+// A file that is no sound database at all counts as one corrupt entry; `repair` puts an empty one in its place.
 Result<DiskCacheReport> verify_disk_cache(const std::filesystem::path& directory, bool repair);
 
 }  // namespace lodestone
