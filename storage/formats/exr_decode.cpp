@@ -128,6 +128,12 @@ Result<void> read_chunks(Reader& reader, const Layout& layout, float* heights, f
       result = EXR_ERR_BAD_CHUNK_LEADER;
       break;
     }
+    // The library would leave the rest of a short uncompressed chunk as the memory was.
+    if (chunk.packed_size > chunk.unpacked_size ||
+        (chunk.compression == EXR_COMPRESSION_NONE && chunk.packed_size != chunk.unpacked_size)) {
+      result = EXR_ERR_CORRUPT_CHUNK;
+      break;
+    }
     result = is_ready ? exr_decoding_update(c, 0, &chunk, &pipe) : exr_decoding_initialize(c, 0, &chunk, &pipe);
     if (result != EXR_ERR_SUCCESS) break;
     const auto aim = [&](int channel, float* to) {

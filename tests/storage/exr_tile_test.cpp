@@ -6,6 +6,7 @@
 #include <OpenEXR/ImfVecAttribute.h>
 #include <OpenImageIO/imageio.h>
 #include <gtest/gtest.h>
+#include <libdeflate.h>
 #include <unistd.h>
 
 #include <bit>
@@ -291,6 +292,38 @@ TEST_P(HostileExr, DeclaredSizesAreCheckedFirst) {
   auto within_limit = with_window(0, 0, 4095, 4095);  // allowed size, but the file holds no such thing
   ASSERT_FALSE(within_limit);
   EXPECT_EQ(within_limit.error().code, ErrorCode::kCorrupt) << within_limit.error().message;
+}
+
+// Memory that no byte of the file filled must not be served as heights.
+TEST_P(HostileExr, AChunkThatHoldsTooFewBytesIsRefused) {
+  const int posts = 9;  // zip, piz, pxr24: a single chunk, at the end of the file
+  auto encoded = encode_exr_tile(std::vector<float>(81, 100.0f), {}, posts, {}, {GetParam()});
+  ASSERT_TRUE(encoded);
+  auto bytes = bytes_of(*encoded);
+  const std::size_t row_bytes = 8 + posts * sizeof(float);
+  if (GetParam() == ExrCompression::kNone) {
+    const std::size_t size_at = bytes.size() - row_bytes + 4;
+    bytes[size_at] = 4;
+  } else {
+    std::uint32_t size = 0;
+    std::size_t chunk = 0;  // found by its own size: a chunk's head is its line (0) and the bytes that follow to the end
+    for (std::size_t at = 0; at + 8 < bytes.size(); ++at) {
+      std::memcpy(&size, &bytes[at + 4], 4);
+      if (size == bytes.size() - at - 8 && std::memcmp(&bytes[at], "\0\0\0\0", 4) == 0) chunk = at;
+    }
+    ASSERT_GT(chunk, 300u);
+    const std::vector<std::uint8_t> inside(40, 7);
+    std::vector<std::uint8_t> deflated(100);
+    libdeflate_compressor* deflater = libdeflate_alloc_compressor(6);
+    size = static_cast<std::uint32_t>(libdeflate_zlib_compress(deflater, inside.data(), inside.size(), deflated.data(), deflated.size()));
+    libdeflate_free_compressor(deflater);
+    ASSERT_GT(size, 0u);
+    bytes.resize(chunk + 8);
+    std::memcpy(&bytes[chunk + 4], &size, 4);
+    bytes.insert(bytes.end(), deflated.begin(), deflated.begin() + size);
+  }
+  auto decoded = decode_exr_tile(bytes);
+  EXPECT_FALSE(decoded);
 }
 
 INSTANTIATE_TEST_SUITE_P(Compressions, HostileExr, testing::ValuesIn(kAll));

@@ -13,6 +13,7 @@
 #include <fstream>
 #include <limits>
 #include <memory>
+#include <thread>
 
 #include "tests/support/sample_terrain.h"
 
@@ -158,6 +159,25 @@ TEST(TiffTile, IsTheSameFileEveryTimeAndNamesNoPathNorTime) {
   EXPECT_EQ(*first, *second);
   EXPECT_EQ(first->find("vsimem"), std::string::npos);
   EXPECT_EQ(MemoryTiff(*first).get()->GetMetadataItem("TIFFTAG_DATETIME"), nullptr);
+}
+
+TEST(TiffTile, ThreadsDoNotDisturbEachOther) {
+  const auto heights_m = sample_terrain(33);
+  const auto wkt = wkt_of(32611);
+  const auto alone = encode_tiff_tile(heights_m, 33, kRotated, wkt, sample_attributes());
+  ASSERT_TRUE(alone);
+  std::array<int, 4> equal{};
+  std::vector<std::thread> threads;
+  for (int& count : equal) {
+    threads.emplace_back([&] {
+      for (int k = 0; k < 20; ++k) {
+        const auto tile = encode_tiff_tile(heights_m, 33, kRotated, wkt, sample_attributes());
+        if (tile && *tile == *alone) ++count;
+      }
+    });
+  }
+  for (auto& thread : threads) thread.join();
+  for (const int count : equal) EXPECT_EQ(count, 20);
 }
 
 TEST(TiffTile, RefusesBadArguments) {
