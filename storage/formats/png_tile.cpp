@@ -13,7 +13,7 @@ namespace lodestone {
 namespace {
 
 constexpr int kMaxPosts = 1 << 14;
-constexpr int kDeflateLevel = 6;
+constexpr int kDeflateLevel = 3;  // 6 takes 2.5 to 4.6 times as long for files 5 to 12 % smaller
 
 // Heights at the pixels: size * size, surrounded by `ring` further pixels on every side.
 struct Field {
