@@ -1,7 +1,7 @@
 #pragma once
-// Base-2 logarithm and power from + - * / and bit operations only, so that every IEEE machine gets the same bits. Branch-free and
-// inline: loops over arrays of a fixed block length become vector code.
-// Needs round-to-nearest and no contraction (the build sets -ffp-contract=off).
+// Base-2 logarithm and power from + - * / and bit operations only, so that every IEEE machine gets the same
+// bits. Branch-free and inline: loops over arrays of a fixed block length become vector code. Needs
+// round-to-nearest and no contraction (the build sets -ffp-contract=off).
 
 #include <array>
 #include <bit>
@@ -21,15 +21,18 @@ inline constexpr std::array<double, 13> kExpSeries = [] {
   std::array<double, 13> c{};
   c[0] = 1;
   for (int n = 1; n < 13; ++n) {
-    c[static_cast<std::size_t>(n)] = c[static_cast<std::size_t>(n - 1)] * 0.693147180559945309417232121458 / n;
+    c[static_cast<std::size_t>(n)] =
+        c[static_cast<std::size_t>(n - 1)] * 0.693147180559945309417232121458 / n;
   }
   return c;
 }();
 
-// x: positive, normal, finite. x = 2^k m with m in [sqrt(1/2), sqrt(2)), log2 m by the series in z = (m - 1) / (m + 1), |z| < 0.172.
+// x: positive, normal, finite. x = 2^k m with m in [sqrt(1/2), sqrt(2)), log2 m by the series in z = (m - 1)
+// / (m + 1), |z| < 0.172.
 inline double log2(double x) {
   const std::uint64_t bits = std::bit_cast<std::uint64_t>(x);
-  const std::uint64_t exponent = (bits + 0x00095f6200000000u) >> 52;  // biased; carries over from sqrt(2) upwards
+  const std::uint64_t exponent =
+      (bits + 0x00095f6200000000u) >> 52;  // biased; carries over from sqrt(2) upwards
   const double m = std::bit_cast<double>(bits - (exponent << 52) + 0x3ff0000000000000u);
   // exponent as the low bits of 2^52 + exponent
   const double k = std::bit_cast<double>(exponent | 0x4330000000000000u) - (4503599627370496.0 + 1023.0);
@@ -48,7 +51,8 @@ inline double log2(double x) {
   return k + z * p;
 }
 
-// |x| < 1000. x = k + r with r in [-1/2, 1/2]; adding 1.5 * 2^52 rounds to an integer and leaves it in the low bits.
+// |x| < 1000. x = k + r with r in [-1/2, 1/2]; adding 1.5 * 2^52 rounds to an integer and leaves it in the
+// low bits.
 inline double exp2(double x) {
   const double shifted = x + 6755399441055744.0;
   const double r = x - (shifted - 6755399441055744.0);

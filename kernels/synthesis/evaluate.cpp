@@ -1,8 +1,11 @@
 // Hold-out metrics of SPEC-SYNTHESIS 9, items 5-7. Readings of the text:
-//   box energies  every 9x9 box that fits in the finest level (the whole level where it is narrower); energy = mean over its valid
+//   box energies  every 9x9 box that fits in the finest level (the whole level where it is narrower); energy
+//   = mean over its valid
 //                 coefficients of d1^2 + d2^2 + d3^2; boxes with fewer than half valid are left out
-//   spectrum      Welch: half-overlapping square blocks of 2^n <= 256 posts without voids, plane removed, Hann window, 2-D FFT;
-//                 power averaged over rings of whole wave numbers, over x and y alike; plain least squares of log2 power over log2 frequency
+//   spectrum      Welch: half-overlapping square blocks of 2^n <= 256 posts without voids, plane removed,
+//   Hann window, 2-D FFT;
+//                 power averaged over rings of whole wave numbers, over x and y alike; plain least squares of
+//                 log2 power over log2 frequency
 //   kurtosis      fourth over squared second moment about zero; 0 when there are no details
 
 #include "kernels/synthesis/evaluate.h"
@@ -44,7 +47,9 @@ double kurtosis_of(const Sums& s) {
   return variance > kFlatVariance ? s.fourth / static_cast<double>(s.count) / (variance * variance) : 0.0;
 }
 
-HeightGrid coarse_grid(AnalysisStep&& step) { return {step.coarse, std::move(step.low_m), std::move(step.low_void)}; }
+HeightGrid coarse_grid(AnalysisStep&& step) {
+  return {step.coarse, std::move(step.low_m), std::move(step.low_void)};
+}
 
 // Energies of boxes; negative where too few coefficients are valid.
 std::vector<double> box_energies(const AnalysisStep& step, const std::vector<std::uint8_t>& invalid) {
@@ -139,7 +144,8 @@ void fft(Complex* v, std::size_t n, std::size_t stride, const std::vector<Comple
         Complex& a = v[(from + k) * stride];
         Complex& b = v[(from + k + half) * stride];
         const Complex w = roots[k * (n / (2 * half))];
-        const Complex turned(b.real() * w.real() - b.imag() * w.imag(), b.real() * w.imag() + b.imag() * w.real());
+        const Complex turned(b.real() * w.real() - b.imag() * w.imag(),
+                             b.real() * w.imag() + b.imag() * w.real());
         b = a - turned;
         a += turned;
       }
@@ -148,7 +154,8 @@ void fft(Complex* v, std::size_t n, std::size_t stride, const std::vector<Comple
 }
 
 // Adds one block's power to the rings: ring r holds wave numbers that round to r cycles per block.
-void add_block(const HeightGrid& grid, std::int64_t i0, std::int64_t j0, std::int64_t n, std::vector<double>& rings) {
+void add_block(const HeightGrid& grid, std::int64_t i0, std::int64_t j0, std::int64_t n,
+               std::vector<double>& rings) {
   const auto un = static_cast<std::size_t>(n);
   std::vector<double> z(un * un);
   double mean = 0, slope_x = 0, slope_y = 0, norm = 0;
@@ -183,7 +190,8 @@ void add_block(const HeightGrid& grid, std::int64_t i0, std::int64_t j0, std::in
   std::vector<double> power(rings.size(), 0.0), count(rings.size(), 0.0);
   for (std::int64_t j = 0; j < n; ++j) {
     for (std::int64_t i = 0; i < n; ++i) {
-      const auto kx = static_cast<double>(i <= n / 2 ? i : i - n), ky = static_cast<double>(j <= n / 2 ? j : j - n);
+      const auto kx = static_cast<double>(i <= n / 2 ? i : i - n),
+                 ky = static_cast<double>(j <= n / 2 ? j : j - n);
       const auto ring = static_cast<std::size_t>(std::sqrt(kx * kx + ky * ky) + 0.5);
       if (ring >= rings.size()) continue;
       power[ring] += std::norm(f[static_cast<std::size_t>(j * n + i)]);
@@ -203,7 +211,8 @@ bool has_void(const HeightGrid& a, const HeightGrid& b, std::int64_t i0, std::in
   return false;
 }
 
-// Slope of log2 power over log2 frequency between 2^-(k+2) and 0.45 cycles per post; 0 when nothing can be measured.
+// Slope of log2 power over log2 frequency between 2^-(k+2) and 0.45 cycles per post; 0 when nothing can be
+// measured.
 double ring_slope(const std::vector<double>& rings, std::int64_t n, int k) {
   double count = 0, sx = 0, sy = 0, sxx = 0, sxy = 0;
   for (std::size_t r = 1; r < rings.size(); ++r) {

@@ -106,7 +106,8 @@ LsaEnergy lsa_energy(const std::array<SigmaMap, 3>& maps) {
   return energy;
 }
 
-std::array<BandSigma, 3> band_sigmas(std::span<const BandFit, 3> fits, const LsaEnergy* energy, bool match_energy) {
+std::array<BandSigma, 3> band_sigmas(std::span<const BandFit, 3> fits, const LsaEnergy* energy,
+                                     bool match_energy) {
   std::array<BandSigma, 3> bands;
   for (std::size_t t = 0; t < 3; ++t) {
     const BandFit& fit = fits[t];

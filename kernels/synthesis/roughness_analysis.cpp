@@ -9,15 +9,18 @@
 namespace lodestone {
 namespace {
 
-// Whole-sample mirror of i into [lo, hi], as often as it takes: worlds of one or two posts reflect more than once.
+// Whole-sample mirror of i into [lo, hi], as often as it takes: worlds of one or two posts reflect more than
+// once.
 std::int64_t reflected(std::int64_t i, std::int64_t lo, std::int64_t hi) {
   if (lo == hi) return lo;
   while (i < lo || i > hi) i = i < lo ? 2 * lo - i : 2 * hi - i;
   return i;
 }
 
-// Where the fine posts 2(c0-1) .. 2(c1+1) of one direction are found, counted from `origin`; [0] is post 2(c0-1).
-std::vector<std::size_t> sources(std::int64_t c0, std::int64_t c1, std::int64_t lo, std::int64_t hi, std::int64_t origin) {
+// Where the fine posts 2(c0-1) .. 2(c1+1) of one direction are found, counted from `origin`; [0] is post
+// 2(c0-1).
+std::vector<std::size_t> sources(std::int64_t c0, std::int64_t c1, std::int64_t lo, std::int64_t hi,
+                                 std::int64_t origin) {
   std::vector<std::size_t> at;
   at.reserve(static_cast<std::size_t>(2 * (c1 - c0) + 5));
   for (std::int64_t i = 2 * (c0 - 1); i <= 2 * (c1 + 1); ++i) {
@@ -26,9 +29,10 @@ std::vector<std::size_t> sources(std::int64_t c0, std::int64_t c1, std::int64_t 
   return at;
 }
 
-// x[n] -> coarse c[I] = x[2I] + (d[I-1] + d[I]) / 4 and detail d[I] = x[2I+1] - (x[2I] + x[2I+2]) / 2 for one row.
-// `at` as made by sources(); scratch: 2n + 3 + n + 1 floats.
-void lift_row(const float* x, const std::vector<std::size_t>& at, std::size_t n, float* scratch, float* low, float* high) {
+// x[n] -> coarse c[I] = x[2I] + (d[I-1] + d[I]) / 4 and detail d[I] = x[2I+1] - (x[2I] + x[2I+2]) / 2 for one
+// row. `at` as made by sources(); scratch: 2n + 3 + n + 1 floats.
+void lift_row(const float* x, const std::vector<std::size_t>& at, std::size_t n, float* scratch, float* low,
+              float* high) {
   float* post = scratch;
   float* d = scratch + 2 * n + 3;
   for (std::size_t i = 0; i < 2 * n + 3; ++i) post[i] = x[at[i]];
@@ -40,7 +44,8 @@ void lift_row(const float* x, const std::vector<std::size_t>& at, std::size_t n,
 }
 
 // The same for validity: a coefficient is void when some post under its filter is.
-void void_row(const std::uint8_t* x, const std::vector<std::size_t>& at, std::size_t n, std::uint8_t* low, std::uint8_t* high) {
+void void_row(const std::uint8_t* x, const std::vector<std::size_t>& at, std::size_t n, std::uint8_t* low,
+              std::uint8_t* high) {
   for (std::size_t i = 0; i < n; ++i) {
     high[i] = x[at[2 * i + 2]] | x[at[2 * i + 3]] | x[at[2 * i + 4]];
     low[i] = x[at[2 * i]] | x[at[2 * i + 1]] | high[i];
@@ -83,7 +88,9 @@ void drop_outside(const PostWindow& world, AnalysisStep& step) {
   const std::int64_t n = c.width();
   for (std::size_t t = 0; t < 3; ++t) {
     const std::int64_t odd_x = t != 1, odd_y = t != 0;
-    if (world.contains(2 * c.i0 + odd_x, 2 * c.j0 + odd_y) && world.contains(2 * c.i1 + odd_x, 2 * c.j1 + odd_y)) continue;
+    if (world.contains(2 * c.i0 + odd_x, 2 * c.j0 + odd_y) &&
+        world.contains(2 * c.i1 + odd_x, 2 * c.j1 + odd_y))
+      continue;
     for (std::int64_t j = c.j0; j <= c.j1; ++j) {
       for (std::int64_t i = c.i0; i <= c.i1; ++i) {
         if (world.contains(2 * i + odd_x, 2 * j + odd_y)) continue;
@@ -98,14 +105,16 @@ void drop_outside(const PostWindow& world, AnalysisStep& step) {
 }  // namespace
 
 PostWindow analysis_window(const PostWindow& coarse, const PostWindow& world) {
-  return {std::clamp(2 * coarse.i0 - 2, world.i0, world.i1), std::clamp(2 * coarse.j0 - 2, world.j0, world.j1),
-          std::clamp(2 * coarse.i1 + 2, world.i0, world.i1), std::clamp(2 * coarse.j1 + 2, world.j0, world.j1)};
+  return {
+      std::clamp(2 * coarse.i0 - 2, world.i0, world.i1), std::clamp(2 * coarse.j0 - 2, world.j0, world.j1),
+      std::clamp(2 * coarse.i1 + 2, world.i0, world.i1), std::clamp(2 * coarse.j1 + 2, world.j0, world.j1)};
 }
 
 AnalysisStep analyse(const HeightGrid& fine, const PostWindow& world, const PostWindow& coarse) {
   const PostWindow need = analysis_window(coarse, world);
   assert(!coarse.is_empty() && "an empty rectangle has no analysis");
-  assert(fine.window.contains(need.i0, need.j0) && fine.window.contains(need.i1, need.j1) && "fine posts are missing");
+  assert(fine.window.contains(need.i0, need.j0) && fine.window.contains(need.i1, need.j1) &&
+         "fine posts are missing");
   AnalysisStep step;
   step.coarse = coarse;
   const auto n = static_cast<std::size_t>(coarse.width());
@@ -121,7 +130,8 @@ AnalysisStep analyse(const HeightGrid& fine, const PostWindow& world, const Post
   std::vector<float> low(fine_rows * n), high(fine_rows * n), scratch(3 * n + 4);
   for (std::size_t r = 0; r < fine_rows; ++r) {
     const auto first = fine.index(fine.window.i0, need.j0 + static_cast<std::int64_t>(r));
-    lift_row(fine.heights_m.data() + first, columns, n, scratch.data(), low.data() + r * n, high.data() + r * n);
+    lift_row(fine.heights_m.data() + first, columns, n, scratch.data(), low.data() + r * n,
+             high.data() + r * n);
   }
 
   // Along y: d2, d3 of coarse row j - 1 are kept in `above`, those of row j go to `here`.

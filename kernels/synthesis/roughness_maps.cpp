@@ -1,5 +1,6 @@
-// LSA: local variance of the last real levels around each coefficient of the finest one, and the local power law through it.
-// Source: Perez et al. eq. 8; SPEC-SYNTHESIS 3.4. Every entry depends on global positions only, so rectangles of a map are its crops.
+// LSA: local variance of the last real levels around each coefficient of the finest one, and the local power
+// law through it. Source: Perez et al. eq. 8; SPEC-SYNTHESIS 3.4. Every entry depends on global positions
+// only, so rectangles of a map are its crops.
 
 #include <algorithm>
 #include <cassert>
@@ -34,23 +35,28 @@ bool odd_y(int band) { return band != 0; }
 double window_bias(int w) { return w == 1 ? 1.832746 : w == 3 ? 0.166208 : w == 5 ? 0.058477 : 0.029643; }
 
 // Coefficients that exist along one direction of a level with fine posts a..b.
-Range existing(std::int64_t a, std::int64_t b, bool is_odd) { return {ceil_shift(a, 1), floor_shift(is_odd ? b - 1 : b, 1)}; }
+Range existing(std::int64_t a, std::int64_t b, bool is_odd) {
+  return {ceil_shift(a, 1), floor_shift(is_odd ? b - 1 : b, 1)};
+}
 
-// First coefficient of the window of detail level l around map entry `entry` (local), shifted inwards into `all`.
-std::int64_t window_start(std::int64_t entry, std::int64_t world0, bool is_odd, int l, int w, const Range& all) {
+// First coefficient of the window of detail level l around map entry `entry` (local), shifted inwards into
+// `all`.
+std::int64_t window_start(std::int64_t entry, std::int64_t world0, bool is_odd, int l, int w,
+                          const Range& all) {
   const std::int64_t x = world0 + 2 * entry + (is_odd ? 1 : 0);
   const std::int64_t centre = is_odd ? x >> l : (x + (std::int64_t{1} << (l - 1))) >> l;
   return std::clamp(centre - w / 2, all.lo, all.hi - w + 1);
 }
 
-// Windows of detail level l that a band's entries look at, by their first coefficients; empty if the level is too small.
+// Windows of detail level l that a band's entries look at, by their first coefficients; empty if the level is
+// too small.
 struct WindowStarts {
   Range x, y;
   bool is_usable = false;
 };
 
-WindowStarts window_starts(const PostWindow& entries, const PostWindow& world, const PostWindow& level_world, int band, int l,
-                           int w) {
+WindowStarts window_starts(const PostWindow& entries, const PostWindow& world, const PostWindow& level_world,
+                           int band, int l, int w) {
   const Range all_x = existing(level_world.i0, level_world.i1, odd_x(band));
   const Range all_y = existing(level_world.j0, level_world.j1, odd_y(band));
   WindowStarts starts;
@@ -64,8 +70,8 @@ WindowStarts window_starts(const PostWindow& entries, const PostWindow& world, c
 }
 
 PostWindow clamped_entries(const PostWindow& entries, const std::array<std::int64_t, 2>& size) {
-  return {std::max<std::int64_t>(entries.i0, 0), std::max<std::int64_t>(entries.j0, 0), std::min(entries.i1, size[0] - 1),
-          std::min(entries.j1, size[1] - 1)};
+  return {std::max<std::int64_t>(entries.i0, 0), std::max<std::int64_t>(entries.j0, 0),
+          std::min(entries.i1, size[0] - 1), std::min(entries.j1, size[1] - 1)};
 }
 
 // log2 of the local variance, bias removed, for each window start of a level (or kFlat, kUnusable).
@@ -73,7 +79,9 @@ struct LevelLogs {
   int level = 1;  // s = -level
   WindowStarts starts;
   std::vector<double> log2_v;
-  const double* row(std::int64_t start_y) const { return log2_v.data() + (start_y - starts.y.lo) * starts.x.size(); }
+  const double* row(std::int64_t start_y) const {
+    return log2_v.data() + (start_y - starts.y.lo) * starts.x.size();
+  }
 };
 
 // Sums over w consecutive elements: out[i] = in[i] + .. + in[i + w - 1], left to right. Whole blocks.
@@ -91,7 +99,8 @@ void sum_along(const T* in, int w, std::size_t padded, T* out) {
 
 // The same over w rows, first row first; row y of the ring is at (y % w) * stride.
 template <class T>
-void sum_rows(const T* ring, std::size_t stride, std::size_t first, int w, std::size_t from, std::array<T, kBlock>& sum) {
+void sum_rows(const T* ring, std::size_t stride, std::size_t first, int w, std::size_t from,
+              std::array<T, kBlock>& sum) {
   sum.fill(T{0});
   for (int k = 0; k < w; ++k) {
     const T* row = ring + (first + static_cast<std::size_t>(k)) % static_cast<std::size_t>(w) * stride + from;
@@ -102,13 +111,15 @@ void sum_rows(const T* ring, std::size_t stride, std::size_t first, int w, std::
 LevelLogs level_logs(const AnalysisStep& step, int band, int level, const WindowStarts& starts, int w) {
   const auto t = static_cast<std::size_t>(band);
   const PostWindow reads{starts.x.lo, starts.y.lo, starts.x.hi + w - 1, starts.y.hi + w - 1};
-  assert(step.coarse.contains(reads.i0, reads.j0) && step.coarse.contains(reads.i1, reads.j1) && "see lsa_needs()");
+  assert(step.coarse.contains(reads.i0, reads.j0) && step.coarse.contains(reads.i1, reads.j1) &&
+         "see lsa_needs()");
   const auto nx = static_cast<std::size_t>(starts.x.size());
   const auto columns = static_cast<std::size_t>(reads.width());
   const auto rows = static_cast<std::size_t>(reads.height());
   const std::size_t padded = (nx + kBlock - 1) / kBlock * kBlock;
   const auto first_of = [&](std::size_t r) {
-    return static_cast<std::size_t>((reads.j0 + static_cast<std::int64_t>(r) - step.coarse.j0) * step.coarse.width() +
+    return static_cast<std::size_t>((reads.j0 + static_cast<std::int64_t>(r) - step.coarse.j0) *
+                                        step.coarse.width() +
                                     (reads.i0 - step.coarse.i0));
   };
   const std::vector<std::uint8_t>& voids = step.detail_void[t];
@@ -118,7 +129,8 @@ LevelLogs level_logs(const AnalysisStep& step, int band, int level, const Window
     has_voids = std::any_of(v, v + columns, [](std::uint8_t flag) { return flag != 0; });
   }
 
-  // By number of valid coefficients: the variance is flat up to `flat_sum`, and log2 of a sum becomes that of the mean, unbiased.
+  // By number of valid coefficients: the variance is flat up to `flat_sum`, and log2 of a sum becomes that of
+  // the mean, unbiased.
   const int all = w * w;
   std::array<double, 50> flat_sum{}, shift{};
   for (int n = 1; n <= all; ++n) {
@@ -132,7 +144,8 @@ LevelLogs level_logs(const AnalysisStep& step, int band, int level, const Window
   std::vector<int> valid(has_voids ? padded + uw : 0), valid_ring(has_voids ? padded * uw : 0);
   for (std::size_t r = 0; r < rows; ++r) {
     const float* d = step.detail_m[t].data() + first_of(r);
-    for (std::size_t i = 0; i < columns; ++i) square[i] = static_cast<double>(d[i]) * static_cast<double>(d[i]);
+    for (std::size_t i = 0; i < columns; ++i)
+      square[i] = static_cast<double>(d[i]) * static_cast<double>(d[i]);
     if (has_voids) {
       const std::uint8_t* v = voids.data() + first_of(r);
       for (std::size_t i = 0; i < columns; ++i) {
@@ -157,7 +170,8 @@ LevelLogs level_logs(const AnalysisStep& step, int band, int level, const Window
                                                 : det::log2(sum[i]) - shift[n];
         }
       } else {
-        const double limit = flat_sum[static_cast<std::size_t>(all)], by = shift[static_cast<std::size_t>(all)];
+        const double limit = flat_sum[static_cast<std::size_t>(all)],
+                     by = shift[static_cast<std::size_t>(all)];
         for (std::size_t i = 0; i < kBlock; ++i) {
           const double value = det::log2(sum[i] > limit ? sum[i] : limit) - by;
           result[i] = sum[i] > limit ? value : kFlat;
@@ -169,7 +183,8 @@ LevelLogs level_logs(const AnalysisStep& step, int band, int level, const Window
   return logs;
 }
 
-// The line through one choice of levels, as weights: gamma = trust_slope + slope . L (then clamped), A = offset + mean . L - gamma * mean_l.
+// The line through one choice of levels, as weights: gamma = trust_slope + slope . L (then clamped), A =
+// offset + mean . L - gamma * mean_l.
 struct LineRule {
   std::array<double, kMaxLevels> slope{}, mean{};
   double gamma = 0;   // share of the layer's gamma
@@ -207,7 +222,8 @@ LineRule line_rule(std::span<const LevelLogs> levels, unsigned usable, const Ban
 class LocalLines {
  public:
   LocalLines(std::span<const LevelLogs> levels, const BandFit& fit, double trust) : count_(levels.size()) {
-    for (unsigned usable = 0; usable < (1U << count_); ++usable) rules_.push_back(line_rule(levels, usable, fit, trust));
+    for (unsigned usable = 0; usable < (1U << count_); ++usable)
+      rules_.push_back(line_rule(levels, usable, fit, trust));
   }
 
   void apply(const std::array<Block, kMaxLevels>& logs, Block& a, Block& gamma, Block& scale) const {
@@ -241,7 +257,8 @@ class LocalLines {
   }
 
  private:
-  void apply_one(const std::array<Block, kMaxLevels>& logs, std::size_t i, Block& a, Block& gamma, Block& scale) const {
+  void apply_one(const std::array<Block, kMaxLevels>& logs, std::size_t i, Block& a, Block& gamma,
+                 Block& scale) const {
     unsigned usable = 0;
     bool is_first = true, is_flat = false;
     for (std::size_t k = 0; k < count_; ++k) {
@@ -268,8 +285,8 @@ class LocalLines {
   std::vector<LineRule> rules_;
 };
 
-SigmaMap band_map(const PostWindow& entries, const PostWindow& world, std::span<const AnalysisStep> steps, int band,
-                  const BandFit& fit, const LsaParameters& parameters) {
+SigmaMap band_map(const PostWindow& entries, const PostWindow& world, std::span<const AnalysisStep> steps,
+                  int band, const BandFit& fit, const LsaParameters& parameters) {
   const auto size = sigma_map_size(world, band);
   const PostWindow e = clamped_entries(entries, size);
   SigmaMap map;
@@ -315,8 +332,8 @@ SigmaMap band_map(const PostWindow& entries, const PostWindow& world, std::span<
   for (std::size_t j = 0; j < height; ++j) {
     std::array<const double*, kMaxLevels> rows{};
     for (std::size_t k = 0; k < levels.size(); ++k) {
-      rows[k] = levels[k].row(window_start(e.j0 + static_cast<std::int64_t>(j), world.j0, odd_y(band), levels[k].level, w,
-                                           all_rows[k]));
+      rows[k] = levels[k].row(window_start(e.j0 + static_cast<std::int64_t>(j), world.j0, odd_y(band),
+                                           levels[k].level, w, all_rows[k]));
     }
     for (std::size_t from = 0; from < width; from += kBlock) {
       for (std::size_t k = 0; k < levels.size(); ++k) {
@@ -343,7 +360,8 @@ std::array<std::int64_t, 2> sigma_map_size(const PostWindow& world, int band) {
   return {along(world.width(), odd_x(band)), along(world.height(), odd_y(band))};
 }
 
-std::vector<PostWindow> lsa_needs(const PostWindow& entries, const PostWindow& world, const LsaParameters& parameters) {
+std::vector<PostWindow> lsa_needs(const PostWindow& entries, const PostWindow& world,
+                                  const LsaParameters& parameters) {
   std::vector<PostWindow> needs;
   PostWindow level_world = world;
   for (int l = 1; l <= parameters.levels; ++l) {
@@ -365,10 +383,12 @@ std::vector<PostWindow> lsa_needs(const PostWindow& entries, const PostWindow& w
   return needs;
 }
 
-std::array<SigmaMap, 3> lsa_maps(const PostWindow& entries, const PostWindow& world, std::span<const AnalysisStep> steps,
-                                 std::span<const BandFit, 3> fits, const LsaParameters& parameters) {
+std::array<SigmaMap, 3> lsa_maps(const PostWindow& entries, const PostWindow& world,
+                                 std::span<const AnalysisStep> steps, std::span<const BandFit, 3> fits,
+                                 const LsaParameters& parameters) {
   assert(world.i0 % 2 == 0 && world.j0 % 2 == 0 && "the base level starts on an even post");
-  assert(parameters.levels >= 1 && parameters.levels <= kMaxLevels && parameters.window >= 1 && parameters.window <= 7);
+  assert(parameters.levels >= 1 && parameters.levels <= kMaxLevels && parameters.window >= 1 &&
+         parameters.window <= 7);
   std::array<SigmaMap, 3> maps;
   for (int band = 0; band < 3; ++band) {
     const auto t = static_cast<std::size_t>(band);

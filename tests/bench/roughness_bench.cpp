@@ -1,4 +1,5 @@
-// Cost of the steps of ingest that touch every post: logarithm and power, one analysis step, LSA maps, their energy.
+// Cost of the steps of ingest that touch every post: logarithm and power, one analysis step, LSA maps, their
+// energy.
 
 #include <benchmark/benchmark.h>
 

@@ -1,4 +1,5 @@
-// Hold-out metrics on terrain whose answers are known, and the hold-out check of GSA and LSA on fractal terrain made here.
+// Hold-out metrics on terrain whose answers are known, and the hold-out check of GSA and LSA on fractal
+// terrain made here.
 
 #include "kernels/synthesis/evaluate.h"
 
@@ -12,7 +13,8 @@ namespace {
 
 // Inverse of analyse() for worlds that start at post 0 and have an odd number of posts: y first, then x.
 HeightGrid synthesise(const HeightGrid& coarse, const std::array<std::vector<float>, 3>& d) {
-  const std::int64_t cw = coarse.window.width(), ch = coarse.window.height(), fw = 2 * cw - 1, fh = 2 * ch - 1;
+  const std::int64_t cw = coarse.window.width(), ch = coarse.window.height(), fw = 2 * cw - 1,
+                     fh = 2 * ch - 1;
   const auto detail = [&](std::size_t t, std::int64_t i, std::int64_t j) {
     const std::int64_t x = t == 1 ? i : std::min(std::max<std::int64_t>(i, 0), cw - 2);
     const std::int64_t y = t == 0 ? j : std::min(std::max<std::int64_t>(j, 0), ch - 2);
@@ -34,15 +36,18 @@ HeightGrid synthesise(const HeightGrid& coarse, const std::array<std::vector<flo
   for (std::int64_t j = 0; j < fh; ++j) {
     float* out = fine.heights_m.data() + j * fw;
     for (std::int64_t i = 0; i < cw; ++i) {
-      const float west = hx[cell(std::max<std::int64_t>(i - 1, 0), j)], east = hx[cell(std::min(i, cw - 2), j)];
+      const float west = hx[cell(std::max<std::int64_t>(i - 1, 0), j)],
+                  east = hx[cell(std::min(i, cw - 2), j)];
       out[2 * i] = lo[cell(i, j)] - (west + east) * 0.25F;
     }
-    for (std::int64_t i = 0; i + 1 < cw; ++i) out[2 * i + 1] = hx[cell(i, j)] + (out[2 * i] + out[2 * i + 2]) * 0.5F;
+    for (std::int64_t i = 0; i + 1 < cw; ++i)
+      out[2 * i + 1] = hx[cell(i, j)] + (out[2 * i] + out[2 * i + 2]) * 0.5F;
   }
   return fine;
 }
 
-// Terrain by its own wavelet series: deviation sigma q^s at a cell, sigma changing smoothly by a factor of 2^contrast.
+// Terrain by its own wavelet series: deviation sigma q^s at a cell, sigma changing smoothly by a factor of
+// 2^contrast.
 HeightGrid fractal(int levels, double roughness_h, double contrast, unsigned seed) {
   std::mt19937 random(seed);
   std::normal_distribution<double> g;
@@ -54,7 +59,8 @@ HeightGrid fractal(int levels, double roughness_h, double contrast, unsigned see
     std::array<std::vector<float>, 3> d;
     for (auto& band : d) {
       for (std::int64_t n = 0; n < w * w; ++n) {
-        const double x = static_cast<double>(n % w) / static_cast<double>(w), y = static_cast<double>(n / w) / static_cast<double>(w);
+        const double x = static_cast<double>(n % w) / static_cast<double>(w),
+                     y = static_cast<double>(n / w) / static_cast<double>(w);
         const double local = std::exp2(contrast * std::sin(9 * x + 1) * std::cos(7 * y));
         band.push_back(static_cast<float>(sigma * local * g(random)));
       }
@@ -78,7 +84,8 @@ LevelVariance variances_of(const AnalysisStep& step) {
 }
 
 // Bilinear interpolation of a map at coefficient (X, Y) of the first new level but s (SPEC-SYNTHESIS 3.5).
-double sigma_at(const SigmaMap& map, const std::vector<double>& value, std::size_t t, std::int64_t X, std::int64_t Y, int s) {
+double sigma_at(const SigmaMap& map, const std::vector<double>& value, std::size_t t, std::int64_t X,
+                std::int64_t Y, int s) {
   const auto locate = [&](std::int64_t fine, double off, std::int64_t n, std::int64_t& at) {
     double u = (static_cast<double>(fine) / std::ldexp(1.0, s + 1) - off) / 2;
     u = std::min(std::max(u, 0.0), static_cast<double>(n - 1));
@@ -87,8 +94,11 @@ double sigma_at(const SigmaMap& map, const std::vector<double>& value, std::size
   };
   std::int64_t i = 0, j = 0;
   const double fx = locate(X, t == 1 ? 0 : 1, map.width, i), fy = locate(Y, t == 0 ? 0 : 1, map.height, j);
-  const auto v = [&](std::int64_t a, std::int64_t b) { return value[static_cast<std::size_t>(b * map.width + a)]; };
-  const double top = v(i, j) + fx * (v(i + 1, j) - v(i, j)), bottom = v(i, j + 1) + fx * (v(i + 1, j + 1) - v(i, j + 1));
+  const auto v = [&](std::int64_t a, std::int64_t b) {
+    return value[static_cast<std::size_t>(b * map.width + a)];
+  };
+  const double top = v(i, j) + fx * (v(i + 1, j) - v(i, j)),
+               bottom = v(i, j + 1) + fx * (v(i + 1, j + 1) - v(i, j + 1));
   return top + fy * (bottom - top);
 }
 
@@ -112,7 +122,8 @@ HoldOut hold_out(const HeightGrid& real, int k, unsigned seed) {
     grid = {steps.back().coarse, steps.back().low_m, steps.back().low_void};
   }
   const auto fits = fit_layer(variances, FitWeights::kWeighted);
-  const auto maps = lsa_maps({0, 0, base.window.width(), base.window.height()}, base.window, steps, fits, parameters);
+  const auto maps =
+      lsa_maps({0, 0, base.window.width(), base.window.height()}, base.window, steps, fits, parameters);
   const LsaEnergy energy = lsa_energy(maps);
   const auto bands = band_sigmas(fits, &energy, true);
 
@@ -125,12 +136,14 @@ HoldOut hold_out(const HeightGrid& real, int k, unsigned seed) {
     for (std::size_t t = 0; t < 3; ++t) {
       std::vector<double> level_map;
       for (std::size_t n = 0; n < maps[t].s0.size(); ++n) {
-        level_map.push_back(maps[t].s0[n] * std::pow(static_cast<double>(maps[t].q[n]), s) * bands[t].kappa[static_cast<std::size_t>(s)]);
+        level_map.push_back(maps[t].s0[n] * std::pow(static_cast<double>(maps[t].q[n]), s) *
+                            bands[t].kappa[static_cast<std::size_t>(s)]);
       }
       for (std::int64_t n = 0; n < w * h; ++n) {
         const double noise = g(random);
         const std::int64_t X = 2 * (n % w) + (t == 1 ? 0 : 1), Y = 2 * (n / w) + (t == 0 ? 0 : 1);
-        gsa[t].push_back(static_cast<float>(noise * fits[t].s0 * std::pow(static_cast<double>(fits[t].q), s)));
+        gsa[t].push_back(
+            static_cast<float>(noise * fits[t].s0 * std::pow(static_cast<double>(fits[t].q), s)));
         lsa[t].push_back(static_cast<float>(noise * sigma_at(maps[t], level_map, t, X, Y, s)));
       }
     }
@@ -163,7 +176,8 @@ TEST(CompareLevels, SeesTwiceTheHeightAsFourTimesTheVariance) {
   EXPECT_NEAR(m.slope_real, m.slope_synthetic, 1e-9);
 }
 
-// White noise has a flat spectrum; its running sum along both axes falls with 2 on the axes, so only the white one is stated.
+// White noise has a flat spectrum; its running sum along both axes falls with 2 on the axes, so only the
+// white one is stated.
 TEST(CompareLevels, MeasuresAFlatSpectrumAndAGaussianKurtosisOfNoise) {
   std::mt19937 random(8);
   std::normal_distribution<float> g;
@@ -179,7 +193,8 @@ TEST(CompareLevels, MeasuresTheSlopeOfAPowerLaw) {
   constexpr int kSize = 256;
   std::mt19937 random(9);
   std::normal_distribution<double> g;
-  // Separable random phases on integer wave numbers: f(x, y) = sum of a(k) cos(2 pi (kx x + ky y) / 256 + phase).
+  // Separable random phases on integer wave numbers: f(x, y) = sum of a(k) cos(2 pi (kx x + ky y) / 256 +
+  // phase).
   HeightGrid grid{{0, 0, kSize - 1, kSize - 1}, std::vector<float>(kSize * kSize), {}};
   std::vector<double> cosine(kSize), height(kSize * kSize);
   for (int i = 0; i < kSize; ++i) cosine[static_cast<std::size_t>(i)] = std::cos(2 * M_PI * i / kSize);
@@ -191,7 +206,8 @@ TEST(CompareLevels, MeasuresTheSlopeOfAPowerLaw) {
       const int phase = static_cast<int>(random() % kSize);
       for (int y = 0; y < kSize; ++y) {
         for (int x = 0; x < kSize; ++x) {
-          height[static_cast<std::size_t>(y * kSize + x)] += a * cosine[static_cast<std::size_t>((kx * x + ky * y + phase) & (kSize - 1))];
+          height[static_cast<std::size_t>(y * kSize + x)] +=
+              a * cosine[static_cast<std::size_t>((kx * x + ky * y + phase) & (kSize - 1))];
         }
       }
     }
@@ -217,16 +233,19 @@ TEST(CompareLevels, LeavesVoidPostsOut) {
 }
 
 TEST(CompareLevels, IsFiniteOnDegenerateGrids) {
-  for (const PostWindow w : {PostWindow{0, 0, 0, 0}, {0, 0, 1, 1}, {0, 0, 0, 40}, {3, 5, 12, 30}, {0, 0, 40, 40}}) {
+  for (const PostWindow w :
+       {PostWindow{0, 0, 0, 0}, {0, 0, 1, 1}, {0, 0, 0, 40}, {3, 5, 12, 30}, {0, 0, 40, 40}}) {
     for (const int kind : {0, 1, 2}) {  // flat, all void, flat against rough
       HeightGrid real{w, std::vector<float>(static_cast<std::size_t>(w.width() * w.height()), 7.0F), {}};
       if (kind == 1) real.is_void.assign(real.heights_m.size(), 1);
       HeightGrid other = real;
       if (kind == 2) {
-        for (std::size_t n = 0; n < other.heights_m.size(); ++n) other.heights_m[n] = static_cast<float>(n * n % 17);
+        for (std::size_t n = 0; n < other.heights_m.size(); ++n)
+          other.heights_m[n] = static_cast<float>(n * n % 17);
       }
       const HoldOutMetrics m = compare_levels(real, other, 3);
-      for (const double v : {m.band_rms, m.rough_corr, m.slope_real, m.slope_synthetic, m.kurtosis_real, m.kurtosis_synthetic}) {
+      for (const double v : {m.band_rms, m.rough_corr, m.slope_real, m.slope_synthetic, m.kurtosis_real,
+                             m.kurtosis_synthetic}) {
         EXPECT_TRUE(std::isfinite(v)) << kind << ' ' << w.width() << 'x' << w.height();
       }
       if (kind < 2) {

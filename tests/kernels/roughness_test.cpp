@@ -1,4 +1,5 @@
-// The power law of GSA and the maps of LSA against the specification's numbers, a plain twin, and their own crops.
+// The power law of GSA and the maps of LSA against the specification's numbers, a plain twin, and their own
+// crops.
 
 #include "kernels/synthesis/roughness.h"
 
@@ -93,12 +94,13 @@ TEST_P(FitVectors, AreThoseOfTheSpecification) {
 
 INSTANTIATE_TEST_SUITE_P(
     Spec, FitVectors,
-    testing::Values(FitCase{{4, 9, 30, 70}, {4096, 1024, 256, 64}, FitWeights::kWeighted, 0.641446, 1.338864, false},
-                    FitCase{{4, 9, 30, 70}, {4096, 1024, 256, 64}, FitWeights::kPaper, 0.520321, 1.412481, false},
-                    FitCase{{4, 9, 30, 70}, {64, 16, 4, 1}, FitWeights::kWeighted, 0.830075, 1.169925, false},
-                    FitCase{{4, 9, 30, 70}, {64, 16, 4, 1}, FitWeights::kPaper, 0.830075, 1.169925, false},
-                    FitCase{{1, 40, 900}, {4096, 1024, 256}, FitWeights::kWeighted, -3.661834, 4, true},
-                    FitCase{{8, 2, 1}, {4096, 1024, 256}, FitWeights::kWeighted, 2.219048, 0.2, true}));
+    testing::Values(
+        FitCase{{4, 9, 30, 70}, {4096, 1024, 256, 64}, FitWeights::kWeighted, 0.641446, 1.338864, false},
+        FitCase{{4, 9, 30, 70}, {4096, 1024, 256, 64}, FitWeights::kPaper, 0.520321, 1.412481, false},
+        FitCase{{4, 9, 30, 70}, {64, 16, 4, 1}, FitWeights::kWeighted, 0.830075, 1.169925, false},
+        FitCase{{4, 9, 30, 70}, {64, 16, 4, 1}, FitWeights::kPaper, 0.830075, 1.169925, false},
+        FitCase{{1, 40, 900}, {4096, 1024, 256}, FitWeights::kWeighted, -3.661834, 4, true},
+        FitCase{{8, 2, 1}, {4096, 1024, 256}, FitWeights::kWeighted, 2.219048, 0.2, true}));
 
 TEST(Fit, GoesThroughTheFinestLevelWhereFewerThanTwoAreUsable) {
   const std::vector<BandVariance> levels{{8, 9}, {100, 4}};
@@ -109,7 +111,8 @@ TEST(Fit, GoesThroughTheFinestLevelWhereFewerThanTwoAreUsable) {
 }
 
 TEST(Fit, OfFlatOrMissingTerrainIsFlatAndFinite) {
-  for (const auto& levels : {std::vector<BandVariance>{}, {{0, 4096}, {5, 1024}}, {{0x1p-40, 64}}, {{0, 0}}}) {
+  for (const auto& levels :
+       {std::vector<BandVariance>{}, {{0, 4096}, {5, 1024}}, {{0x1p-40, 64}}, {{0, 0}}}) {
     const BandFit fit = fit_band(levels, FitWeights::kWeighted);
     EXPECT_TRUE(fit.is_flat);
     EXPECT_EQ(fit.s0, 0);
@@ -120,7 +123,8 @@ TEST(Fit, OfFlatOrMissingTerrainIsFlatAndFinite) {
 TEST(Fit, OfALayerIsTheFitOfEachBand) {
   std::vector<LevelVariance> levels(3);
   for (std::size_t n = 0; n < 3; ++n) {
-    for (std::size_t t = 0; t < 3; ++t) levels[n][t] = {std::pow(2.0, 1.0 + static_cast<double>(n * (t + 1))), 4096 >> (2 * n)};
+    for (std::size_t t = 0; t < 3; ++t)
+      levels[n][t] = {std::pow(2.0, 1.0 + static_cast<double>(n * (t + 1))), 4096 >> (2 * n)};
   }
   const auto fits = fit_layer(levels, FitWeights::kWeighted);
   for (std::size_t t = 0; t < 3; ++t) EXPECT_NEAR(fits[t].gamma, static_cast<double>(t + 1), 1e-12);
@@ -130,11 +134,13 @@ TEST(Fit, OfALayerIsTheFitOfEachBand) {
 
 TEST(Analysis, OfTheSpecificationsGridGivesItsNumbers) {
   const HeightGrid h5{{0, 0, 4, 4},
-                      {100, 104, 112, 108, 96, 102, 110, 120, 114, 100, 98, 107, 125, 119, 104, 95, 101, 116, 111, 99, 90, 97, 108, 103, 94},
+                      {100, 104, 112, 108, 96,  102, 110, 120, 114, 100, 98,  107, 125,
+                       119, 104, 95,  101, 116, 111, 99,  90,  97,  108, 103, 94},
                       {}};
   const AnalysisStep step = analyse(h5, h5.window, coarse_world(h5.window));
   EXPECT_EQ(step.coarse, (PostWindow{0, 0, 2, 2}));
-  EXPECT_THAT(step.low_m, ElementsAre(101.0625F, 113.5F, 97.9375F, 96.875F, 125.3125F, 106.25F, 89.1875F, 107.625F, 95.0625F));
+  EXPECT_THAT(step.low_m, ElementsAre(101.0625F, 113.5F, 97.9375F, 96.875F, 125.3125F, 106.25F, 89.1875F,
+                                      107.625F, 95.0625F));
   EXPECT_THAT(step.detail_m[0], ElementsAre(-0.875F, 3.875F, 0, -4.25F, 4.5F, 0, -2.625F, 2.125F, 0));
   EXPECT_THAT(step.detail_m[1], ElementsAre(4.125F, 2, -0.125F, 0.375F, -0.75F, 0.125F, 0, 0, 0));
   EXPECT_THAT(step.detail_m[2], ElementsAre(2.25F, -0.25F, 0, -1.25F, 0.25F, 0, 0, 0, 0));
@@ -145,20 +151,25 @@ TEST(Analysis, OfTheSpecificationsGridGivesItsNumbers) {
 }
 
 // The filters written as taps, in double, on a mirror that repeats for ever.
-double filtered(const HeightGrid& g, const PostWindow& world, std::int64_t x, std::int64_t y, bool high_x, bool high_y, bool& is_void) {
+double filtered(const HeightGrid& g, const PostWindow& world, std::int64_t x, std::int64_t y, bool high_x,
+                bool high_y, bool& is_void) {
   const auto mirror = [](std::int64_t i, std::int64_t lo, std::int64_t hi) {
     const std::int64_t period = 2 * (hi - lo);
     if (period == 0) return lo;
     const std::int64_t r = ((i - lo) % period + period) % period;
     return lo + (r > hi - lo ? period - r : r);
   };
-  const auto taps = [](bool high) { return high ? std::vector<double>{-0.5, 1, -0.5} : std::vector<double>{-0.125, 0.25, 0.75, 0.25, -0.125}; };
+  const auto taps = [](bool high) {
+    return high ? std::vector<double>{-0.5, 1, -0.5} : std::vector<double>{-0.125, 0.25, 0.75, 0.25, -0.125};
+  };
   const auto tx = taps(high_x), ty = taps(high_y);
   double sum = 0;
   for (std::size_t b = 0; b < ty.size(); ++b) {
     for (std::size_t a = 0; a < tx.size(); ++a) {
-      const auto i = mirror(x + static_cast<std::int64_t>(a) - static_cast<std::int64_t>(tx.size() / 2), world.i0, world.i1);
-      const auto j = mirror(y + static_cast<std::int64_t>(b) - static_cast<std::int64_t>(ty.size() / 2), world.j0, world.j1);
+      const auto i = mirror(x + static_cast<std::int64_t>(a) - static_cast<std::int64_t>(tx.size() / 2),
+                            world.i0, world.i1);
+      const auto j = mirror(y + static_cast<std::int64_t>(b) - static_cast<std::int64_t>(ty.size() / 2),
+                            world.j0, world.j1);
       sum += tx[a] * ty[b] * g.at(i, j);
       is_void = is_void || g.void_at(i, j);
     }
@@ -179,9 +190,11 @@ TEST_P(AnalysisOfWorlds, IsTheFilterBankWithMirroredBorders) {
   const AnalysisStep step = analyse(fine, world, coarse_world(world));
   for (std::int64_t j = step.coarse.j0; j <= step.coarse.j1; ++j) {
     for (std::int64_t i = step.coarse.i0; i <= step.coarse.i1; ++i) {
-      const auto at = static_cast<std::size_t>((j - step.coarse.j0) * step.coarse.width() + i - step.coarse.i0);
+      const auto at =
+          static_cast<std::size_t>((j - step.coarse.j0) * step.coarse.width() + i - step.coarse.i0);
       bool is_void = false;
-      EXPECT_NEAR(step.low_m[at], filtered(fine, world, 2 * i, 2 * j, false, false, is_void), 1e-3) << i << ' ' << j;
+      EXPECT_NEAR(step.low_m[at], filtered(fine, world, 2 * i, 2 * j, false, false, is_void), 1e-3)
+          << i << ' ' << j;
       EXPECT_EQ(!step.low_void.empty() && step.low_void[at] != 0, is_void) << i << ' ' << j;
       for (std::size_t t = 0; t < 3; ++t) {
         const bool hx = t != 1, hy = t != 0;
@@ -192,7 +205,8 @@ TEST_P(AnalysisOfWorlds, IsTheFilterBankWithMirroredBorders) {
           continue;
         }
         bool detail_void = false;
-        EXPECT_NEAR(step.detail_m[t][at], filtered(fine, world, x, y, hx, hy, detail_void), 1e-3) << t << ' ' << i << ' ' << j;
+        EXPECT_NEAR(step.detail_m[t][at], filtered(fine, world, x, y, hx, hy, detail_void), 1e-3)
+            << t << ' ' << i << ' ' << j;
         EXPECT_EQ(step.detail_void[t][at] != 0, detail_void) << t << ' ' << i << ' ' << j;
       }
     }
@@ -206,7 +220,9 @@ TEST_P(AnalysisOfWorlds, ByRectanglesIsTheCropBitForBit) {
   const AnalysisStep whole = analyse(fine, world, all);
   std::mt19937 random(7);
   for (int round = 0; round < 40; ++round) {
-    const auto pick = [&](std::int64_t lo, std::int64_t hi) { return std::uniform_int_distribution<std::int64_t>(lo, hi)(random); };
+    const auto pick = [&](std::int64_t lo, std::int64_t hi) {
+      return std::uniform_int_distribution<std::int64_t>(lo, hi)(random);
+    };
     PostWindow r;
     r.i0 = pick(all.i0, all.i1);
     r.i1 = pick(r.i0, all.i1);
@@ -218,9 +234,11 @@ TEST_P(AnalysisOfWorlds, ByRectanglesIsTheCropBitForBit) {
         const auto p = static_cast<std::size_t>((j - r.j0) * r.width() + i - r.i0);
         const auto w = static_cast<std::size_t>((j - all.j0) * all.width() + i - all.i0);
         ASSERT_EQ(std::memcmp(&part.low_m[p], &whole.low_m[w], 4), 0) << i << ' ' << j;
-        ASSERT_EQ(!part.low_void.empty() && part.low_void[p] != 0, !whole.low_void.empty() && whole.low_void[w] != 0);
+        ASSERT_EQ(!part.low_void.empty() && part.low_void[p] != 0,
+                  !whole.low_void.empty() && whole.low_void[w] != 0);
         for (std::size_t t = 0; t < 3; ++t) {
-          ASSERT_EQ(std::memcmp(&part.detail_m[t][p], &whole.detail_m[t][w], 4), 0) << t << ' ' << i << ' ' << j;
+          ASSERT_EQ(std::memcmp(&part.detail_m[t][p], &whole.detail_m[t][w], 4), 0)
+              << t << ' ' << i << ' ' << j;
           ASSERT_EQ(part.detail_void[t][p], whole.detail_void[t][w]);
         }
       }
@@ -229,9 +247,12 @@ TEST_P(AnalysisOfWorlds, ByRectanglesIsTheCropBitForBit) {
 }
 
 INSTANTIATE_TEST_SUITE_P(Sizes, AnalysisOfWorlds,
-                         testing::Values(World{{0, 0, 16, 16}}, World{{0, 0, 17, 20}, 0.03}, World{{3, 5, 20, 32}}, World{{-7, 4, 8, 19}, 0.05},
-                                         World{{0, 0, 0, 0}}, World{{1, 1, 1, 1}}, World{{0, 0, 1, 1}}, World{{1, 3, 2, 4}}, World{{0, 0, 0, 13}},
-                                         World{{5, 0, 5, 12}}, World{{4, 7, 23, 7}, 0.1}, World{{3, 0, 5, 2}}, World{{0, 0, 9, 9}, 1.0}));
+                         testing::Values(World{{0, 0, 16, 16}}, World{{0, 0, 17, 20}, 0.03},
+                                         World{{3, 5, 20, 32}}, World{{-7, 4, 8, 19}, 0.05},
+                                         World{{0, 0, 0, 0}}, World{{1, 1, 1, 1}}, World{{0, 0, 1, 1}},
+                                         World{{1, 3, 2, 4}}, World{{0, 0, 0, 13}}, World{{5, 0, 5, 12}},
+                                         World{{4, 7, 23, 7}, 0.1}, World{{3, 0, 5, 2}},
+                                         World{{0, 0, 9, 9}, 1.0}));
 
 // -------- LSA
 
@@ -264,7 +285,9 @@ std::array<BandFit, 3> fits_of(const std::vector<AnalysisStep>& steps) {
   return fit_layer(levels, FitWeights::kWeighted);
 }
 
-PostWindow whole_map(const PostWindow& world) { return {0, 0, (world.width() + 1) / 2, (world.height() + 1) / 2}; }
+PostWindow whole_map(const PostWindow& world) {
+  return {0, 0, (world.width() + 1) / 2, (world.height() + 1) / 2};
+}
 
 struct Lsa {
   PostWindow world;
@@ -291,7 +314,10 @@ TEST_P(LsaMaps, FollowTheTextEntryByEntry) {
   const auto fits = fits_of(steps);
   const LsaParameters p = parameters();
   const auto maps = lsa_maps(whole_map(world), world, steps, fits, p);
-  const double bias = p.window == 1 ? 1.832746 : p.window == 3 ? 0.166208 : p.window == 5 ? 0.058477 : 0.029643;
+  const double bias = p.window == 1   ? 1.832746
+                      : p.window == 3 ? 0.166208
+                      : p.window == 5 ? 0.058477
+                                      : 0.029643;
   for (std::size_t t = 0; t < 3; ++t) {
     const bool hx = t != 1, hy = t != 0;
     const SigmaMap& map = maps[t];
@@ -309,7 +335,8 @@ TEST_P(LsaMaps, FollowTheTextEntryByEntry) {
           while (x0 <= x1 && 2 * x0 < fine.i0) ++x0;
           while (y0 <= y1 && 2 * y0 < fine.j0) ++y0;
           if (x1 - x0 + 1 < p.window || y1 - y0 + 1 < p.window) continue;
-          const double x = static_cast<double>(world.i0 + 2 * I + (hx ? 1 : 0)), y = static_cast<double>(world.j0 + 2 * J + (hy ? 1 : 0));
+          const double x = static_cast<double>(world.i0 + 2 * I + (hx ? 1 : 0)),
+                       y = static_cast<double>(world.j0 + 2 * J + (hy ? 1 : 0));
           const double step = std::ldexp(1.0, l);
           const auto cx = static_cast<std::int64_t>(std::floor(x / step + (hx ? 0 : 0.5)));
           const auto cy = static_cast<std::int64_t>(std::floor(y / step + (hy ? 0 : 0.5)));
@@ -320,7 +347,8 @@ TEST_P(LsaMaps, FollowTheTextEntryByEntry) {
           for (std::int64_t b = sy; b < sy + p.window; ++b) {
             for (std::int64_t a = sx; a < sx + p.window; ++a) {
               const auto& s = steps[static_cast<std::size_t>(l - 1)];
-              const auto at = static_cast<std::size_t>((b - s.coarse.j0) * s.coarse.width() + a - s.coarse.i0);
+              const auto at =
+                  static_cast<std::size_t>((b - s.coarse.j0) * s.coarse.width() + a - s.coarse.i0);
               if (s.detail_void[t][at] != 0) continue;
               sum += std::pow(static_cast<double>(s.detail_m[t][at]), 2);
               ++n;
@@ -333,8 +361,10 @@ TEST_P(LsaMaps, FollowTheTextEntryByEntry) {
         double a = fits[t].a, gamma = fits[t].gamma;
         if (!xs.empty()) {
           double mx = 0, my = 0, sxx = 0, sxy = 0;
-          for (std::size_t k = 0; k < xs.size(); ++k) mx += xs[k] / static_cast<double>(xs.size()), my += ys[k] / static_cast<double>(xs.size());
-          for (std::size_t k = 0; k < xs.size(); ++k) sxx += (xs[k] - mx) * (xs[k] - mx), sxy += (xs[k] - mx) * (ys[k] - my);
+          for (std::size_t k = 0; k < xs.size(); ++k)
+            mx += xs[k] / static_cast<double>(xs.size()), my += ys[k] / static_cast<double>(xs.size());
+          for (std::size_t k = 0; k < xs.size(); ++k)
+            sxx += (xs[k] - mx) * (xs[k] - mx), sxy += (xs[k] - mx) * (ys[k] - my);
           if (xs.size() > 1) gamma = std::clamp(p.trust * (-sxy / sxx) + (1 - p.trust) * gamma, 0.2, 4.0);
           a = my + gamma * mx;
         }
@@ -355,7 +385,9 @@ TEST_P(LsaMaps, ByRectanglesAreTheCropBitForBit) {
   const auto fits = fits_of(whole);
   const auto all = lsa_maps(whole_map(world), world, whole, fits, p);
   std::mt19937 random(13);
-  const auto pick = [&](std::int64_t lo, std::int64_t hi) { return std::uniform_int_distribution<std::int64_t>(lo, hi)(random); };
+  const auto pick = [&](std::int64_t lo, std::int64_t hi) {
+    return std::uniform_int_distribution<std::int64_t>(lo, hi)(random);
+  };
   for (int round = 0; round < 25; ++round) {
     PostWindow r;
     r.i0 = pick(0, (world.width() - 1) / 2);
@@ -385,9 +417,11 @@ TEST_P(LsaMaps, ByRectanglesAreTheCropBitForBit) {
 }
 
 INSTANTIATE_TEST_SUITE_P(Worlds, LsaMaps,
-                         testing::Values(Lsa{{0, 0, 64, 64}, 3, 3}, Lsa{{0, 0, 150, 43}, 3, 3}, Lsa{{0, 0, 61, 90}, 5, 3, 0.01},
-                                         Lsa{{6, 10, 77, 61}, 7, 2}, Lsa{{-2, 2, 50, 33}, 1, 4, 0.02}, Lsa{{0, 0, 40, 40}, 3, 6, 0.04},
-                                         Lsa{{0, 0, 6, 6}, 3, 3}, Lsa{{0, 0, 1, 1}, 3, 3}, Lsa{{0, 0, 0, 0}, 1, 3}, Lsa{{0, 0, 0, 30}, 1, 3},
+                         testing::Values(Lsa{{0, 0, 64, 64}, 3, 3}, Lsa{{0, 0, 150, 43}, 3, 3},
+                                         Lsa{{0, 0, 61, 90}, 5, 3, 0.01}, Lsa{{6, 10, 77, 61}, 7, 2},
+                                         Lsa{{-2, 2, 50, 33}, 1, 4, 0.02}, Lsa{{0, 0, 40, 40}, 3, 6, 0.04},
+                                         Lsa{{0, 0, 6, 6}, 3, 3}, Lsa{{0, 0, 1, 1}, 3, 3},
+                                         Lsa{{0, 0, 0, 0}, 1, 3}, Lsa{{0, 0, 0, 30}, 1, 3},
                                          Lsa{{0, 0, 30, 1}, 3, 3}, Lsa{{0, 0, 20, 20}, 3, 3, 1.0}));
 
 // Rough on the left, a lake on the right.
@@ -441,7 +475,9 @@ TEST(LsaEnergy, MatchedGivesTheEnergyOfTheFit) {
     for (std::size_t s = 0; s < static_cast<std::size_t>(kMaxDepth); ++s) {
       double sum = 0;
       for (std::size_t n = 0; n < maps[t].s0.size(); ++n) {
-        const double sigma = maps[t].s0[n] * std::pow(static_cast<double>(maps[t].q[n]), static_cast<double>(s)) * bands[t].kappa[s];
+        const double sigma = maps[t].s0[n] *
+                             std::pow(static_cast<double>(maps[t].q[n]), static_cast<double>(s)) *
+                             bands[t].kappa[s];
         sum += sigma * sigma;
       }
       const double expected = std::exp2(fits[t].a - fits[t].gamma * static_cast<double>(s));
