@@ -7,11 +7,18 @@
 typedef std::uint32_t ls_uint;
 typedef std::uint64_t ls_ulong;
 #define LS_FN inline
+#define LS_PRIVATE
 #else
 #pragma OPENCL FP_CONTRACT OFF
 typedef uint ls_uint;
 typedef ulong ls_ulong;
 #define LS_FN static inline __attribute__((always_inline))
+#define LS_PRIVATE __private
+/* Work-items per group, fixed at build time so that no compilation is left for the first launch. */
+#ifndef LS_LOCAL_SIZE
+#define LS_LOCAL_SIZE 64
+#endif
+#define LS_KERNEL __kernel __attribute__((reqd_work_group_size(LS_LOCAL_SIZE, 1, 1)))
 #endif
 
 #endif
