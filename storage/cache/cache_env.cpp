@@ -36,6 +36,10 @@ std::uint64_t map_bytes(std::uint64_t budget_bytes) {
   return std::max(kMinMapBytes, budget_bytes + budget_bytes / 4) / 65536 * 65536;
 }
 
+// LMDB met a page that contradicts itself. It would abort the process; its assert hook may not return, so it throws.
+struct LmdbAssertion {};
+[[noreturn]] void throw_assertion(MDB_env*, const char*) { throw LmdbAssertion{}; }
+
 Error io_error(const std::filesystem::path& path, const std::string& task, int code) {
   return Error{ErrorCode::kIo, "disk cache " + path.string() + ": " + task + " failed: " + lmdb_text(code)};
 }
@@ -143,6 +147,7 @@ Result<void> CacheEnv::open_lmdb(const Options& options) {
   int code = mdb_env_create(&env_);
   if (code == 0) code = mdb_env_set_maxdbs(env_, 4);
   if (code == 0) code = mdb_env_set_maxreaders(env_, 500);
+  if (code == 0) code = mdb_env_set_assert(env_, throw_assertion);
   std::error_code failure;
   const std::uint64_t old_bytes = fd_ < 0 ? 0 : std::filesystem::file_size(directory_ / kDataFile, failure);
   // A file that is too large for the budget still needs room to delete from; shrink() follows.
@@ -170,8 +175,7 @@ Result<void> CacheEnv::open_lmdb(const Options& options) {
   if (fd_ < 0) fd_ = ::open((directory_ / kDataFile).c_str(), O_RDWR | O_CLOEXEC);
   if (fd_ < 0) return io_error(directory_ / kDataFile, "opening", errno);
   pages_ = LmdbPages(fd_, static_cast<std::size_t>(::sysconf(_SC_PAGESIZE)));
-  struct stat info {};
-  if (::fstat(fd_, &info) == 0) file_bytes_ = static_cast<std::uint64_t>(info.st_size);
+  note_file();
   return {};
 }
 
@@ -185,7 +189,8 @@ Result<void> CacheEnv::shrink(const Options& options) {
   std::filesystem::create_directories(copy, failure);
   int code = done.code != 0 ? done.code : failure.value();
   if (code == 0) code = mdb_env_copy2(env_, copy.c_str(), MDB_CP_COMPACT);
-  mdb_env_close(std::exchange(env_, nullptr));
+  if (!std::exchange(is_abandoned_, false)) mdb_env_close(env_);
+  env_ = nullptr;
   ::close(std::exchange(fd_, -1));
   const bool is_small = code == 0 && std::filesystem::file_size(copy / kDataFile, failure) <= map_bytes(options.budget_bytes) && !failure;
   if (is_small) std::filesystem::rename(copy / kDataFile, directory_ / kDataFile, failure);
@@ -198,7 +203,7 @@ Result<void> CacheEnv::shrink(const Options& options) {
 }
 
 CacheEnv::~CacheEnv() {
-  if (env_) mdb_env_close(env_);
+  if (env_ && !is_abandoned_) mdb_env_close(env_);
   if (fd_ >= 0) ::close(fd_);
 }
 
@@ -250,12 +255,61 @@ int CacheEnv::commit(MDB_txn* txn, int code) {
     mdb_txn_abort(txn);
     return code;
   }
-  return mdb_txn_commit(txn);
+  code = mdb_txn_commit(txn);
+  note_file();
+  return code;
+}
+
+void CacheEnv::note_file() {
+  struct stat info {};
+  if (fd_ < 0 || ::fstat(fd_, &info) != 0) return;
+  file_bytes_ = static_cast<std::uint64_t>(info.st_size);
+  file_time_ = info.st_mtim;
+}
+
+// Runs a task that writes. When a bit flips between the last check and now, LMDB may give up within the transaction; then the
+// environment is left as it is (its lock is held, its pages are in between) and the caller starts anew with other files.
+template <class Task>
+CacheEnv::Done CacheEnv::guarded(const Task& task) {
+  const std::uint64_t old_bytes = bytes_, old_entries = entries_;
+  Done done;
+  try {
+    done = task();
+  } catch (const LmdbAssertion&) {
+    is_abandoned_ = true;
+    done = {MDB_CORRUPTED, 0, 0};
+  }
+  if (done.code != 0) {
+    bytes_ = old_bytes;
+    entries_ = old_entries;
+    done.evictions = 0;
+  }
+  return done;
 }
 
 CacheEnv::Done CacheEnv::apply(const Work& work) {
+  return guarded([&] { return apply_checked(work); });
+}
+
+CacheEnv::Done CacheEnv::purge_some(const std::string& tag, std::string& from, std::size_t limit, std::uint64_t& removed) {
+  return guarded([&] { return purge_checked(tag, from, limit, removed); });
+}
+
+CacheEnv::Done CacheEnv::probe() {
+  return guarded([&] {
+    Done done;
+    MDB_txn* txn = nullptr;
+    done.code = mdb_txn_begin(env_, nullptr, 0, &txn);
+    if (done.code != 0) return done;
+    const std::uint64_t number = mdb_txn_id(txn);
+    MDB_val key = val("probe"), value{sizeof number, const_cast<std::uint64_t*>(&number)};
+    done.code = commit(txn, mdb_put(txn, settings_, &key, &value, 0));
+    return done;
+  });
+}
+
+CacheEnv::Done CacheEnv::apply_checked(const Work& work) {
   Done done;
-  const std::uint64_t old_bytes = bytes_, old_entries = entries_;
   LmdbSnapshot snapshot;
   if (const PageStatus status = pages_.newest(snapshot); status != PageStatus::kOk) {
     done.code = status == PageStatus::kReadError ? errno : MDB_CORRUPTED;
@@ -273,7 +327,13 @@ CacheEnv::Done CacheEnv::apply(const Work& work) {
   std::vector<const CacheWrite*> wanted;
   std::uint64_t needed_bytes = work.extra_bytes;
   for (const CacheWrite& write : work.writes) {
-    if (code != 0 || is_stored(snapshot, write)) continue;
+    if (code != 0) break;
+    // A key that this very batch removes is still in the snapshot, so the row in the transaction is asked first.
+    const std::string name = bytes_of_key(write.key);
+    MDB_val name_val = val(name), row_val{};
+    code = mdb_get(txn, rows_, &name_val, &row_val);
+    if (code == 0 && is_stored(snapshot, write)) continue;
+    if (code != 0 && code != MDB_NOTFOUND) break;
     code = remove_entry(txn, snapshot, write.key);
     wanted.push_back(&write);
     needed_bytes += disk_charge(write.tile->body.size(), write.tag.size());
@@ -281,26 +341,7 @@ CacheEnv::Done CacheEnv::apply(const Work& work) {
   if (code == 0) code = evict(txn, snapshot, budget_bytes_ - std::min(needed_bytes, budget_bytes_), done.evictions);
   for (std::size_t i = 0; code == 0 && i < wanted.size(); ++i) code = write(txn, *wanted[i]);
   done.code = commit(txn, code);
-  if (done.code != 0) {
-    bytes_ = old_bytes;
-    entries_ = old_entries;
-    done.evictions = 0;
-    return done;
-  }
   done.writes = wanted.size();
-  struct stat info {};
-  if (::fstat(fd_, &info) == 0) file_bytes_ = static_cast<std::uint64_t>(info.st_size);
-  return done;
-}
-
-CacheEnv::Done CacheEnv::probe() {
-  Done done;
-  MDB_txn* txn = nullptr;
-  done.code = mdb_txn_begin(env_, nullptr, 0, &txn);
-  if (done.code != 0) return done;
-  const std::uint64_t number = mdb_txn_id(txn);
-  MDB_val key = val("probe"), value{sizeof number, const_cast<std::uint64_t*>(&number)};
-  done.code = commit(txn, mdb_put(txn, settings_, &key, &value, 0));
   return done;
 }
 
@@ -424,7 +465,7 @@ int CacheEnv::write(MDB_txn* txn, const CacheWrite& write) {
   return code;
 }
 
-CacheEnv::Done CacheEnv::purge_some(const std::string& tag, std::string& from, std::size_t limit, std::uint64_t& removed) {
+CacheEnv::Done CacheEnv::purge_checked(const std::string& tag, std::string& from, std::size_t limit, std::uint64_t& removed) {
   Done done;
   LmdbSnapshot snapshot;
   if (const PageStatus status = pages_.newest(snapshot); status != PageStatus::kOk) {
@@ -448,15 +489,9 @@ CacheEnv::Done CacheEnv::purge_some(const std::string& tag, std::string& from, s
   from = code == 0 ? std::string(view(name_val)) : std::string();
   if (cursor) mdb_cursor_close(cursor);
   if (code == MDB_NOTFOUND) code = 0;
-  const std::uint64_t old_bytes = bytes_, old_entries = entries_;
   for (std::size_t i = 0; code == 0 && i < doomed.size(); ++i) code = remove_entry(txn, snapshot, doomed[i]);
   done.code = commit(txn, code);
-  if (done.code == 0) {
-    removed += doomed.size();
-  } else {
-    bytes_ = old_bytes;
-    entries_ = old_entries;
-  }
+  if (done.code == 0) removed += doomed.size();
   return done;
 }
 
@@ -512,6 +547,11 @@ bool CacheEnv::is_in_place(std::string& reason) const {
     return false;
   }
   return true;
+}
+
+bool CacheEnv::is_foreign() const {
+  struct stat info {};
+  return ::fstat(fd_, &info) == 0 && (info.st_mtim.tv_sec != file_time_.tv_sec || info.st_mtim.tv_nsec != file_time_.tv_nsec);
 }
 
 PageStatus CacheEnv::keys(std::vector<CacheKey>& out) const {

@@ -5,6 +5,7 @@
 #include <lmdb.h>
 
 #include <cstdint>
+#include <ctime>
 #include <filesystem>
 #include <memory>
 #include <optional>
@@ -80,6 +81,8 @@ class CacheEnv {
 
   // True while the directory still holds the file that is open, and the file has not shrunk.
   bool is_in_place(std::string& reason) const;
+  // True when somebody else has written to the file since our last commit (as far as the clock of file times can tell).
+  bool is_foreign() const;
 
   // All keys, in order.
   PageStatus keys(std::vector<CacheKey>& out) const;
@@ -103,6 +106,11 @@ class CacheEnv {
   int write(MDB_txn* txn, const CacheWrite& write);
   bool is_stored(const LmdbSnapshot& snapshot, const CacheWrite& write) const;
   int commit(MDB_txn* txn, int code);
+  void note_file();
+  Done apply_checked(const Work& work);
+  Done purge_checked(const std::string& tag, std::string& from, std::size_t limit, std::uint64_t& removed);
+  template <class Task>
+  Done guarded(const Task& task);
 
   FileLock lock_;
   std::filesystem::path directory_;
@@ -114,6 +122,8 @@ class CacheEnv {
   std::string hand_;               // of the clock: the next key to look at
   std::uint64_t bytes_ = 0, entries_ = 0;
   std::uint64_t file_bytes_ = 0;   // after the last commit
+  timespec file_time_{};
+  bool is_abandoned_ = false;      // LMDB gave up within a transaction: never closed, see apply()
 };
 
 // For messages: LMDB's codes and errno.

