@@ -18,9 +18,10 @@ Result<FileLock> FileLock::acquire(const std::filesystem::path& path, const std:
     char text[32] = {};
     const ssize_t read_bytes = ::pread(fd, text, sizeof text - 1, 0);
     ::close(fd);
-    const std::string holder = read_bytes > 0 ? std::string("process ") + text : std::string("another process");
-    return Error{ErrorCode::kConflict,
-                 what + " is in use by " + holder + " (lock " + path.string() + "); stop it or wait until it is done"};
+    const std::string holder =
+        read_bytes > 0 ? std::string("process ") + text : std::string("another process");
+    return Error{ErrorCode::kConflict, what + " is in use by " + holder + " (lock " + path.string() +
+                                           "); stop it or wait until it is done"};
   }
   // The holder's pid is for the message only; the lock itself is the kernel's and dies with the process.
   const std::string pid = std::to_string(::getpid());

@@ -48,13 +48,18 @@ Result<void> locate(LayerInfo& info) {
   OGRSpatialReference wgs84;
   wgs84.SetWellKnownGeogCS("WGS84");
   if (crs.SetFromUserInput(info.crs_wkt.c_str()) != OGRERR_NONE) {
-    return Error{ErrorCode::kUnsupported, "layer " + info.name + ": its coordinate reference system cannot be read; assign one with gdal_translate -a_srs"};
+    return Error{
+        ErrorCode::kUnsupported,
+        "layer " + info.name +
+            ": its coordinate reference system cannot be read; assign one with gdal_translate -a_srs"};
   }
   crs.SetAxisMappingStrategy(OAMS_TRADITIONAL_GIS_ORDER);
   wgs84.SetAxisMappingStrategy(OAMS_TRADITIONAL_GIS_ORDER);
-  const std::unique_ptr<OGRCoordinateTransformation> to_wgs84(OGRCreateCoordinateTransformation(&crs, &wgs84));
-  const Error no_way{ErrorCode::kUnsupported, "layer " + info.name + ": no transformation from " + info.crs_name +
-                                                  " to WGS84; assign the right system with gdal_translate -a_srs"};
+  const std::unique_ptr<OGRCoordinateTransformation> to_wgs84(
+      OGRCreateCoordinateTransformation(&crs, &wgs84));
+  const Error no_way{ErrorCode::kUnsupported,
+                     "layer " + info.name + ": no transformation from " + info.crs_name +
+                         " to WGS84; assign the right system with gdal_translate -a_srs"};
   if (!to_wgs84) return no_way;
 
   // The rectangle of posts, corner to corner, walked clockwise from the north-west.
@@ -74,11 +79,12 @@ Result<void> locate(LayerInfo& info) {
   walk(i0, j1, i0, j0);
   info.bounds = {ring[0][0], ring[0][1], ring[0][0], ring[0][1]};
   for (const auto& p : ring) {
-    info.bounds = {std::min(info.bounds[0], p[0]), std::min(info.bounds[1], p[1]), std::max(info.bounds[2], p[0]),
-                   std::max(info.bounds[3], p[1])};
+    info.bounds = {std::min(info.bounds[0], p[0]), std::min(info.bounds[1], p[1]),
+                   std::max(info.bounds[2], p[0]), std::max(info.bounds[3], p[1])};
   }
 
-  // Longitudes are unwrapped along the ring, so that a layer across the date line gets west > east and not the whole globe.
+  // Longitudes are unwrapped along the ring, so that a layer across the date line gets west > east and not
+  // the whole globe.
   double west = 0, east = 0, south = 90, north = -90, before = 0;
   const bool is_geographic = crs.IsGeographic() != 0;
   for (std::size_t k = 0; k < ring.size(); ++k) {
@@ -104,7 +110,8 @@ Result<void> locate(LayerInfo& info) {
 
   // A cell at the centre. A single post has no cell; its step still has a length.
   const double ci = (i0 + i1) / 2, cj = (j0 + j1) / 2;
-  std::array<std::array<double, 2>, 3> p = {info.world_from_post(info.base_level, ci, cj), info.world_from_post(info.base_level, ci + 1, cj),
+  std::array<std::array<double, 2>, 3> p = {info.world_from_post(info.base_level, ci, cj),
+                                            info.world_from_post(info.base_level, ci + 1, cj),
                                             info.world_from_post(info.base_level, ci, cj + 1)};
   for (auto& q : p) {
     if (!to_wgs84->Transform(1, &q[0], &q[1])) return no_way;

@@ -1,5 +1,6 @@
 #pragma once
-// Where a layer lies on the Earth: bounds, their WGS84 box and the size of a cell, from its CRS and post transform.
+// Where a layer lies on the Earth: bounds, their WGS84 box and the size of a cell, from its CRS and post
+// transform.
 
 #include <string>
 
@@ -13,7 +14,8 @@ namespace lodestone {
 std::string crs_display_name(const OGRSpatialReference& crs);
 // Name of the vertical CRS of a compound CRS; empty if there is none.
 std::string vertical_datum_of(const OGRSpatialReference& crs);
-// Fills bounds, bounds_wgs84, cell_x_m, cell_y_m from crs_wkt, transform and world. Error: kUnsupported (CRS without a way to WGS84).
+// Fills bounds, bounds_wgs84, cell_x_m, cell_y_m from crs_wkt, transform and world. Error: kUnsupported (CRS
+// without a way to WGS84).
 Result<void> locate(LayerInfo& info);
 
 }  // namespace lodestone

@@ -1,4 +1,5 @@
-// Ingest in passes: read (rasters to base tiles), fill (voids), levels (analysis), roughness (hook), publish (rename).
+// Ingest in passes: read (rasters to base tiles), fill (voids), levels (analysis), roughness (hook), publish
+// (rename).
 
 #include "storage/dem/ingest.h"
 
@@ -28,20 +29,21 @@ constexpr std::size_t kCommitBytes = std::size_t{16} << 20;
 constexpr std::size_t kReadBudgetBytes = std::size_t{64} << 20;  // of all workers' read buffers together
 constexpr std::size_t kDecodedBytes = std::size_t{96} << 20;
 constexpr std::size_t kMaxWaiting = 64;  // encoded tiles between workers and the writer
-constexpr int kOrderBlock = 8;           // tiles are visited in blocks of 8 x 8, so that neighbours are still decoded
+constexpr int kOrderBlock = 8;  // tiles are visited in blocks of 8 x 8, so that neighbours are still decoded
 
 struct TileOutput {
   KeyValue item;
-  std::size_t index = 0;          // row-major among the level's tiles
+  std::size_t index = 0;  // row-major among the level's tiles
   XXH128_hash_t digest{};
-  std::uint8_t void_state = 0;    // 0 no voids, 1 some, 2 all
-  std::int64_t void_posts = 0;    // of the posts that the tile owns
+  std::uint8_t void_state = 0;  // 0 no voids, 1 some, 2 all
+  std::int64_t void_posts = 0;  // of the posts that the tile owns
   float min_m = 0, max_m = 0;
   std::vector<FillBlocks::Part> parts;
-  LevelVariance sums{};           // sums of squares and counts
+  LevelVariance sums{};  // sums of squares and counts
 };
 
-// Posts that tile `id` counts for the layer: all but those that it shares with its eastern and southern neighbours.
+// Posts that tile `id` counts for the layer: all but those that it shares with its eastern and southern
+// neighbours.
 PostWindow owned_part(const LayerInfo& layer, const TileId& id, const PostWindow& stored) {
   const PostWindow tiles = layer.tiles_at(id.z);
   const std::int64_t n = layer.cells_per_tile();
@@ -51,7 +53,8 @@ PostWindow owned_part(const LayerInfo& layer, const TileId& id, const PostWindow
 
 XXH128_hash_t digest_of(const HeightGrid& tile) {
   const XXH128_hash_t heights = XXH3_128bits(tile.heights_m.data(), tile.heights_m.size() * sizeof(float));
-  return XXH3_128bits_withSeed(tile.is_void.data(), tile.is_void.size(), heights.low64 ^ (heights.high64 * 3));
+  return XXH3_128bits_withSeed(tile.is_void.data(), tile.is_void.size(),
+                               heights.low64 ^ (heights.high64 * 3));
 }
 
 std::vector<TileId> visiting_order(int level, const PostWindow& tiles) {
@@ -60,7 +63,8 @@ std::vector<TileId> visiting_order(int level, const PostWindow& tiles) {
   for (std::int64_t by = tiles.j0; by <= tiles.j1; by += kOrderBlock) {
     for (std::int64_t bx = tiles.i0; bx <= tiles.i1; bx += kOrderBlock) {
       for (std::int64_t y = by; y <= std::min(by + kOrderBlock - 1, tiles.j1); ++y) {
-        for (std::int64_t x = bx; x <= std::min(bx + kOrderBlock - 1, tiles.i1); ++x) order.push_back({level, x, y});
+        for (std::int64_t x = bx; x <= std::min(bx + kOrderBlock - 1, tiles.i1); ++x)
+          order.push_back({level, x, y});
       }
     }
   }
@@ -90,8 +94,8 @@ class Batch {
   std::size_t bytes_ = 0;
 };
 
-void add_coefficients(const std::vector<float>& detail, const std::vector<std::uint8_t>& is_void, const PostWindow& all, const PostWindow& owned,
-                      BandVariance& sum) {
+void add_coefficients(const std::vector<float>& detail, const std::vector<std::uint8_t>& is_void,
+                      const PostWindow& all, const PostWindow& owned, BandVariance& sum) {
   for (std::int64_t j = owned.j0; j <= owned.j1; ++j) {
     double row_sum = 0;
     const std::size_t from = static_cast<std::size_t>((j - all.j0) * all.width() + owned.i0 - all.i0);
@@ -106,10 +110,15 @@ void add_coefficients(const std::vector<float>& detail, const std::vector<std::u
 
 class Ingest {
  public:
-  Ingest(const IngestOptions& options, const IngestKernels& kernels, RasterPlan plan, std::shared_ptr<LmdbEnv> env,
-         const std::function<void(const IngestProgress&)>& progress)
-      : options_(options), kernels_(kernels), plan_(std::move(plan)), env_(std::move(env)), progress_(progress),
-        threads_(std::clamp(options.threads, 1, 64)), blocks_(plan_.info.world) {}
+  Ingest(const IngestOptions& options, const IngestKernels& kernels, RasterPlan plan,
+         std::shared_ptr<LmdbEnv> env, const std::function<void(const IngestProgress&)>& progress)
+      : options_(options),
+        kernels_(kernels),
+        plan_(std::move(plan)),
+        env_(std::move(env)),
+        progress_(progress),
+        threads_(std::clamp(options.threads, 1, 64)),
+        blocks_(plan_.info.world) {}
 
   Result<LayerInfo> run() {
     if (auto ok = read(); !ok) return ok.error();
@@ -126,22 +135,32 @@ class Ingest {
     if (progress_) progress_({phase, from + (to - from) * (all > 0 ? done / all : 1)});
   }
 
-  // Rasters to base tiles. A job reads a stretch of tiles at once, so that a raster's blocks are decoded about once.
+  // Rasters to base tiles. A job reads a stretch of tiles at once, so that a raster's blocks are decoded
+  // about once.
   Result<void> read() {
     const int z = info().base_level;
     const PostWindow tiles = info().tiles_at(z);
     const std::int64_t n = info().cells_per_tile();
-    const auto budget_posts = static_cast<double>(std::max<std::size_t>(kReadBudgetBytes / static_cast<std::size_t>(threads_), std::size_t{4} << 20)) / 4;
-    const bool has_strips = info().grid == GridKind::kNative && std::any_of(plan_.rasters.begin(), plan_.rasters.end(), [](const PlannedRaster& r) {
-      return r.block_width >= r.width;
-    });
+    const auto budget_posts =
+        static_cast<double>(std::max<std::size_t>(kReadBudgetBytes / static_cast<std::size_t>(threads_),
+                                                  std::size_t{4} << 20)) /
+        4;
+    const bool has_strips = info().grid == GridKind::kNative &&
+                            std::any_of(plan_.rasters.begin(), plan_.rasters.end(),
+                                        [](const PlannedRaster& r) { return r.block_width >= r.width; });
     // About four jobs a thread where that leaves several tiles a job.
-    const double share = std::max(1.0, static_cast<double>(tiles.width() * tiles.height()) / (4.0 * threads_));
+    const double share =
+        std::max(1.0, static_cast<double>(tiles.width() * tiles.height()) / (4.0 * threads_));
     std::int64_t job_width = 0, job_height = 0;  // tiles
     if (has_strips) {
-      job_width = std::min(tiles.width(), std::max<std::int64_t>(1, static_cast<std::int64_t>(budget_posts / static_cast<double>(n + 1) / static_cast<double>(n))));
-      const auto rows = static_cast<std::int64_t>(budget_posts / static_cast<double>(job_width * n + 1) / static_cast<double>(n));
-      job_height = std::max<std::int64_t>(1, std::min(rows, static_cast<std::int64_t>(share / static_cast<double>(job_width))));
+      job_width = std::min(
+          tiles.width(),
+          std::max<std::int64_t>(1, static_cast<std::int64_t>(budget_posts / static_cast<double>(n + 1) /
+                                                              static_cast<double>(n))));
+      const auto rows = static_cast<std::int64_t>(budget_posts / static_cast<double>(job_width * n + 1) /
+                                                  static_cast<double>(n));
+      job_height = std::max<std::int64_t>(
+          1, std::min(rows, static_cast<std::int64_t>(share / static_cast<double>(job_width))));
     } else {
       const double side = std::min(std::sqrt(budget_posts) / static_cast<double>(n), std::sqrt(share));
       job_width = job_height = std::max<std::int64_t>(1, static_cast<std::int64_t>(side));
@@ -159,7 +178,7 @@ class Ingest {
     std::size_t done = 0;
     auto ok = run_jobs<TileOutput>(
         jobs_x * jobs_y, threads_, kMaxWaiting,
-        [&](std::int64_t job, int worker, const std::function<bool(TileOutput&&)>& emit) -> Result<void> {
+        [&](std::int64_t job, int worker, const std::function<bool(TileOutput &&)>& emit) -> Result<void> {
           auto& reader = readers[static_cast<std::size_t>(worker)];
           if (!reader) {
             auto opened = RasterReader::open(plan_);
@@ -167,8 +186,10 @@ class Ingest {
             reader.emplace(std::move(*opened));
           }
           auto& heights = buffers[static_cast<std::size_t>(worker)];
-          const std::int64_t x0 = tiles.i0 + job % jobs_x * job_width, x1 = std::min(x0 + job_width - 1, tiles.i1);
-          const std::int64_t y0 = tiles.j0 + job / jobs_x * job_height, y1 = std::min(y0 + job_height - 1, tiles.j1);
+          const std::int64_t x0 = tiles.i0 + job % jobs_x * job_width,
+                             x1 = std::min(x0 + job_width - 1, tiles.i1);
+          const std::int64_t y0 = tiles.j0 + job / jobs_x * job_height,
+                             y1 = std::min(y0 + job_height - 1, tiles.j1);
           const PostWindow window = intersection({x0 * n, y0 * n, (x1 + 1) * n, (y1 + 1) * n}, info().world);
           if (auto read = reader->read(window, heights); !read) return read;
           for (std::int64_t y = y0; y <= y1; ++y) {
@@ -201,7 +222,8 @@ class Ingest {
     const auto width = static_cast<std::size_t>(tile.window.width());
     tile.heights_m.reserve(width * static_cast<std::size_t>(tile.window.height()));
     for (std::int64_t j = tile.window.j0; j <= tile.window.j1; ++j) {
-      const float* row = &heights[static_cast<std::size_t>((j - window.j0) * window.width() + tile.window.i0 - window.i0)];
+      const float* row =
+          &heights[static_cast<std::size_t>((j - window.j0) * window.width() + tile.window.i0 - window.i0)];
       tile.heights_m.insert(tile.heights_m.end(), row, row + width);
     }
     TileOutput out;
@@ -251,12 +273,14 @@ class Ingest {
     std::size_t done = 0;
     auto ok = run_jobs<TileOutput>(
         static_cast<std::int64_t>(order.size()), threads_, kMaxWaiting,
-        [&](std::int64_t job, int, const std::function<bool(TileOutput&&)>& emit) -> Result<void> {
+        [&](std::int64_t job, int, const std::function<bool(TileOutput &&)>& emit) -> Result<void> {
           const TileId id = order[static_cast<std::size_t>(job)];
           auto tile = reader.window(z, stored_window(info(), id));
           if (!tile) return tile.error();
           HeightGrid around;
-          around.window = intersection({tile->window.i0 - kFillReach, tile->window.j0 - kFillReach, tile->window.i1 + kFillReach, tile->window.j1 + kFillReach}, info().world);
+          around.window = intersection({tile->window.i0 - kFillReach, tile->window.j0 - kFillReach,
+                                        tile->window.i1 + kFillReach, tile->window.j1 + kFillReach},
+                                       info().world);
           if (is_all_void(around.window)) {
             around.window = tile->window;
             around.heights_m = tile->heights_m;
@@ -310,7 +334,7 @@ class Ingest {
       Batch batch(*env_);
       auto ok = run_jobs<TileOutput>(
           static_cast<std::int64_t>(order.size()), threads_, kMaxWaiting,
-          [&](std::int64_t job, int, const std::function<bool(TileOutput&&)>& emit) -> Result<void> {
+          [&](std::int64_t job, int, const std::function<bool(TileOutput &&)>& emit) -> Result<void> {
             const TileId id = order[static_cast<std::size_t>(job)];
             HeightGrid tile;
             tile.window = stored_window(info(), id);
@@ -320,7 +344,8 @@ class Ingest {
             TileOutput out;
             out.index = index_of(id);
             const PostWindow owned = owned_part(info(), id, tile.window);
-            for (std::size_t t = 0; t < 3; ++t) add_coefficients(step.detail_m[t], step.detail_void[t], tile.window, owned, out.sums[t]);
+            for (std::size_t t = 0; t < 3; ++t)
+              add_coefficients(step.detail_m[t], step.detail_void[t], tile.window, owned, out.sums[t]);
             tile.heights_m = std::move(step.low_m);
             tile.is_void = std::move(step.low_void);
             out.item.key = tile_key(id);
@@ -346,7 +371,8 @@ class Ingest {
       const PostWindow coarse = coarse_world(world);
       AnalysisStep step = kernels_.analyse(*grid, world, coarse);
       LevelVariance sum{};
-      for (std::size_t t = 0; t < 3; ++t) add_coefficients(step.detail_m[t], step.detail_void[t], coarse, coarse, sum[t]);
+      for (std::size_t t = 0; t < 3; ++t)
+        add_coefficients(step.detail_m[t], step.detail_void[t], coarse, coarse, sum[t]);
       add_level({sum});
       *grid = HeightGrid{coarse, std::move(step.low_m), std::move(step.low_void)};
       world = coarse;
@@ -363,7 +389,8 @@ class Ingest {
         level[t].count += tile[t].count;
       }
     }
-    for (BandVariance& band : level) band.variance_m2 = band.count > 0 ? band.variance_m2 / static_cast<double>(band.count) : 0;
+    for (BandVariance& band : level)
+      band.variance_m2 = band.count > 0 ? band.variance_m2 / static_cast<double>(band.count) : 0;
     info().variances.push_back(level);
   }
 
@@ -372,10 +399,11 @@ class Ingest {
     LayerInfo placed = info();
     placed.name.clear();
     placed.sources.clear();
-    const std::string options = layer_info_json(placed) + ";band=" + std::to_string(options_.band) + ";unit=" + options_.unit +
-                                ";format=" + std::to_string(kFormatVersion);
+    const std::string options = layer_info_json(placed) + ";band=" + std::to_string(options_.band) +
+                                ";unit=" + options_.unit + ";format=" + std::to_string(kFormatVersion);
     const XXH128_hash_t tiles = XXH3_128bits(digests_.data(), digests_.size() * sizeof(XXH128_hash_t));
-    const XXH128_hash_t all = XXH3_128bits_withSeed(options.data(), options.size(), tiles.low64 ^ (tiles.high64 * 3));
+    const XXH128_hash_t all =
+        XXH3_128bits_withSeed(options.data(), options.size(), tiles.low64 ^ (tiles.high64 * 3));
     XXH128_canonical_t bytes;
     XXH128_canonicalFromHash(&bytes, all);
     constexpr const char* kHex = "0123456789abcdef";
@@ -394,7 +422,8 @@ class Ingest {
       if (!made) return std::move(made.error()).within("modelling the roughness of layer " + info().name);
       text = std::move(*made);
     }
-    const KeyValue items[] = {{kInfoKey, encode_text(layer_info_json(info()), kInfoKey)}, {kRoughnessKey, encode_text(text, kRoughnessKey)}};
+    const KeyValue items[] = {{kInfoKey, encode_text(layer_info_json(info()), kInfoKey)},
+                              {kRoughnessKey, encode_text(text, kRoughnessKey)}};
     if (auto ok = env_->write(items); !ok) return ok;
     report("publish", 0.97, 1, 0, 1);
     return env_->sync();
@@ -408,19 +437,22 @@ class Ingest {
   const int threads_;
   FillBlocks blocks_;
   bool has_data_ = false;
-  std::vector<XXH128_hash_t> digests_;      // of base tiles, row-major
+  std::vector<XXH128_hash_t> digests_;  // of base tiles, row-major
   std::vector<std::uint8_t> void_state_;
 };
 
-// Removes generations that CURRENT does not name and unfinished files: what a killed ingest left. The lock is held.
+// Removes generations that CURRENT does not name and unfinished files: what a killed ingest left. The lock is
+// held.
 std::int64_t sweep(const fs::path& directory, const std::string& current) {
   std::int64_t newest = 0;
   std::error_code ec;
   std::vector<fs::path> leftovers;
   for (fs::directory_iterator it(directory, ec), end; !ec && it != end; it.increment(ec)) {
     const std::string name = it->path().filename().string();
-    if (name.rfind("gen-", 0) == 0) newest = std::max(newest, static_cast<std::int64_t>(std::strtoll(name.c_str() + 4, nullptr, 10)));
-    if ((name.rfind("gen-", 0) == 0 && name != current) || name == "CURRENT.tmp") leftovers.push_back(it->path());
+    if (name.rfind("gen-", 0) == 0)
+      newest = std::max(newest, static_cast<std::int64_t>(std::strtoll(name.c_str() + 4, nullptr, 10)));
+    if ((name.rfind("gen-", 0) == 0 && name != current) || name == "CURRENT.tmp")
+      leftovers.push_back(it->path());
   }
   for (const fs::path& path : leftovers) fs::remove_all(path, ec);
   return newest;
@@ -440,7 +472,8 @@ Result<void> check_options(const IngestOptions& options) {
   for (const int posts : {65, 129, 257, 513, 1025}) {
     if (options.posts_per_tile == posts) return {};
   }
-  return Error{ErrorCode::kInvalidArgument, "posts per tile must be 65, 129, 257, 513 or 1025, not " + std::to_string(options.posts_per_tile)};
+  return Error{ErrorCode::kInvalidArgument, "posts per tile must be 65, 129, 257, 513 or 1025, not " +
+                                                std::to_string(options.posts_per_tile)};
 }
 
 }  // namespace
@@ -457,7 +490,8 @@ Result<LayerInfo> ingest(const fs::path& data_dir, const IngestOptions& options,
   auto lock = FileLock::acquire(directory / "lock", "layer " + options.layer);
   if (!lock) return lock.error();
   std::string current;
-  if (auto generation = current_generation(data_dir, options.layer)) current = generation->filename().string();
+  if (auto generation = current_generation(data_dir, options.layer))
+    current = generation->filename().string();
   char name[32];
   std::snprintf(name, sizeof name, "gen-%06lld", static_cast<long long>(sweep(directory, current) + 1));
   const fs::path building = directory / (std::string(name) + ".building");

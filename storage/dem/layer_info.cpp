@@ -11,7 +11,8 @@ using nlohmann::json;
 
 constexpr int kSyntheticLevels = 16;  // SPEC: depth limit below the data
 
-// Tiles [first, last] along one axis that hold a cell of [lo, hi], tiles being `span` posts wide; one post: its own tile.
+// Tiles [first, last] along one axis that hold a cell of [lo, hi], tiles being `span` posts wide; one post:
+// its own tile.
 std::array<std::int64_t, 2> tile_range(std::int64_t lo, std::int64_t hi, std::int64_t span) {
   const auto floor_div = [span](std::int64_t a) { return a >= 0 ? a / span : -((-a + span - 1) / span); };
   return {floor_div(lo), floor_div(hi > lo ? hi - 1 : lo)};
@@ -22,12 +23,14 @@ template <class T>
 Result<void> take(const json& object, const char* name, T& out) {
   const auto found = object.find(name);
   if (found == object.end()) {
-    return Error{ErrorCode::kCorrupt, std::string("layer info: field \"") + name + "\" is missing; ingest the layer again"};
+    return Error{ErrorCode::kCorrupt,
+                 std::string("layer info: field \"") + name + "\" is missing; ingest the layer again"};
   }
   try {
     found->get_to(out);
   } catch (const json::exception& e) {
-    return Error{ErrorCode::kCorrupt, std::string("layer info: field \"") + name + "\": " + e.what() + "; ingest the layer again"};
+    return Error{ErrorCode::kCorrupt,
+                 std::string("layer info: field \"") + name + "\": " + e.what() + "; ingest the layer again"};
   }
   return {};
 }
@@ -36,9 +39,12 @@ Result<void> take(const json& object, const char* name, T& out) {
 
 std::string_view to_string(GridKind kind) {
   switch (kind) {
-    case GridKind::kNative: return "native";
-    case GridKind::kWorldCrs84Quad: return "WorldCRS84Quad";
-    case GridKind::kWebMercatorQuad: return "WebMercatorQuad";
+    case GridKind::kNative:
+      return "native";
+    case GridKind::kWorldCrs84Quad:
+      return "WorldCRS84Quad";
+    case GridKind::kWebMercatorQuad:
+      return "WebMercatorQuad";
   }
   return "?";
 }
@@ -47,8 +53,9 @@ Result<GridKind> grid_kind_from(std::string_view name) {
   for (const GridKind kind : {GridKind::kNative, GridKind::kWorldCrs84Quad, GridKind::kWebMercatorQuad}) {
     if (to_string(kind) == name) return kind;
   }
-  return Error{ErrorCode::kInvalidArgument,
-               "grid \"" + std::string(name) + "\" is unknown; use native, WorldCRS84Quad or WebMercatorQuad"};
+  return Error{
+      ErrorCode::kInvalidArgument,
+      "grid \"" + std::string(name) + "\" is unknown; use native, WorldCRS84Quad or WebMercatorQuad"};
 }
 
 int LayerInfo::max_level() const { return base_level + kSyntheticLevels; }
@@ -82,7 +89,8 @@ PostWindow LayerInfo::tile_window(const TileId& id) const {
 std::array<double, 2> LayerInfo::world_from_post(int level, double i, double j) const {
   const double u = std::ldexp(i, base_level - level);
   const double v = std::ldexp(j, base_level - level);
-  return {transform[0] + u * transform[1] + v * transform[2], transform[3] + u * transform[4] + v * transform[5]};
+  return {transform[0] + u * transform[1] + v * transform[2],
+          transform[3] + u * transform[4] + v * transform[5]};
 }
 
 std::array<double, 2> LayerInfo::post_from_world(int level, double x, double y) const {
@@ -98,7 +106,8 @@ std::string layer_info_json(const LayerInfo& info) {
   json variances = json::array();
   for (const LevelVariance& level : info.variances) {
     json bands = json::array();
-    for (const BandVariance& band : level) bands.push_back({{"variance_m2", band.variance_m2}, {"count", band.count}});
+    for (const BandVariance& band : level)
+      bands.push_back({{"variance_m2", band.variance_m2}, {"count", band.count}});
     variances.push_back(bands);
   }
   const PostWindow& w = info.world;
@@ -127,7 +136,8 @@ std::string layer_info_json(const LayerInfo& info) {
 
 Result<LayerInfo> layer_info_from_json(std::string_view text) {
   const json object = json::parse(text, nullptr, false);
-  if (!object.is_object()) return Error{ErrorCode::kCorrupt, "layer info: not a JSON object; ingest the layer again"};
+  if (!object.is_object())
+    return Error{ErrorCode::kCorrupt, "layer info: not a JSON object; ingest the layer again"};
   LayerInfo info;
   std::string grid;
   std::array<std::int64_t, 4> world{};
@@ -161,8 +171,10 @@ Result<LayerInfo> layer_info_from_json(std::string_view text) {
   if (!kind) return Error{ErrorCode::kCorrupt, "layer info: " + kind.error().message};
   info.grid = *kind;
   const int cells = info.posts_per_tile - 1;
-  if (cells < 1 || (cells & (cells - 1)) != 0 || info.base_level < 0 || info.base_level > 40 || info.world.is_empty()) {
-    return Error{ErrorCode::kCorrupt, "layer info: posts_per_tile, base_level or world out of range; ingest the layer again"};
+  if (cells < 1 || (cells & (cells - 1)) != 0 || info.base_level < 0 || info.base_level > 40 ||
+      info.world.is_empty()) {
+    return Error{ErrorCode::kCorrupt,
+                 "layer info: posts_per_tile, base_level or world out of range; ingest the layer again"};
   }
   try {
     for (const json& level : variances) {
@@ -173,18 +185,21 @@ Result<LayerInfo> layer_info_from_json(std::string_view text) {
       info.variances.push_back(bands);
     }
   } catch (const json::exception& e) {
-    return Error{ErrorCode::kCorrupt, std::string("layer info: field \"variances\": ") + e.what() + "; ingest the layer again"};
+    return Error{ErrorCode::kCorrupt,
+                 std::string("layer info: field \"variances\": ") + e.what() + "; ingest the layer again"};
   }
   return info;
 }
 
 Result<void> check_name(std::string_view what, std::string_view name) {
   const auto allowed = [](char c) {
-    return (c >= 'A' && c <= 'Z') || (c >= 'a' && c <= 'z') || (c >= '0' && c <= '9') || c == '.' || c == '_' || c == '-';
+    return (c >= 'A' && c <= 'Z') || (c >= 'a' && c <= 'z') || (c >= '0' && c <= '9') || c == '.' ||
+           c == '_' || c == '-';
   };
   if (name.empty() || name.size() > 64 || name[0] == '.' || !std::all_of(name.begin(), name.end(), allowed)) {
-    return Error{ErrorCode::kInvalidArgument,
-                 std::string(what) + " name breaks the rule: 1 to 64 of A-Z a-z 0-9 . _ - and no dot in front"};
+    return Error{
+        ErrorCode::kInvalidArgument,
+        std::string(what) + " name breaks the rule: 1 to 64 of A-Z a-z 0-9 . _ - and no dot in front"};
   }
   return {};
 }

@@ -18,7 +18,8 @@ namespace {
 constexpr std::int64_t kMaxWindowPosts = std::int64_t{1} << 28;
 
 // Source index of every index lo..hi: mirrored at the world's border, then clamped.
-std::vector<std::int64_t> sources_of(std::int64_t lo, std::int64_t hi, std::int64_t world_lo, std::int64_t world_hi) {
+std::vector<std::int64_t> sources_of(std::int64_t lo, std::int64_t hi, std::int64_t world_lo,
+                                     std::int64_t world_hi) {
   std::vector<std::int64_t> source;
   source.reserve(static_cast<std::size_t>(hi - lo + 1));
   for (std::int64_t i = lo; i <= hi; ++i) source.push_back(mirrored(i, world_lo, world_hi));
@@ -27,8 +28,11 @@ std::vector<std::int64_t> sources_of(std::int64_t lo, std::int64_t hi, std::int6
 
 class LmdbLayerStore final : public LayerStore {
  public:
-  LmdbLayerStore(std::shared_ptr<const LmdbEnv> env, LayerInfo info, std::string roughness, std::size_t decoded_bytes)
-      : info_(std::move(info)), roughness_(std::move(roughness)), reader_(std::move(env), info_, decoded_bytes) {}
+  LmdbLayerStore(std::shared_ptr<const LmdbEnv> env, LayerInfo info, std::string roughness,
+                 std::size_t decoded_bytes)
+      : info_(std::move(info)),
+        roughness_(std::move(roughness)),
+        reader_(std::move(env), info_, decoded_bytes) {}
 
   const LayerInfo& info() const override { return info_; }
   std::string roughness_json() const override { return roughness_; }
@@ -57,7 +61,8 @@ class LmdbLayerStore final : public LayerStore {
         if (has_voids) out.is_void.push_back(inside->is_void[from]);
       }
     }
-    if (std::find(out.is_void.begin(), out.is_void.end(), std::uint8_t{1}) == out.is_void.end()) out.is_void.clear();
+    if (std::find(out.is_void.begin(), out.is_void.end(), std::uint8_t{1}) == out.is_void.end())
+      out.is_void.clear();
     return out;
   }
 
@@ -76,8 +81,10 @@ class LmdbLayerStore final : public LayerStore {
     const std::int64_t n = info_.cells_per_tile();
     const PostWindow tiles = info_.tiles_at(level);
     const auto last = [n](std::int64_t lo, std::int64_t hi) { return (hi > lo ? hi - 1 : lo) / n; };
-    for (std::int64_t y = std::clamp(j0 / n, tiles.j0, tiles.j1); y <= std::clamp(last(j0, j1), tiles.j0, tiles.j1); ++y) {
-      for (std::int64_t x = std::clamp(i0 / n, tiles.i0, tiles.i1); x <= std::clamp(last(i0, i1), tiles.i0, tiles.i1); ++x) {
+    for (std::int64_t y = std::clamp(j0 / n, tiles.j0, tiles.j1);
+         y <= std::clamp(last(j0, j1), tiles.j0, tiles.j1); ++y) {
+      for (std::int64_t x = std::clamp(i0 / n, tiles.i0, tiles.i1);
+           x <= std::clamp(last(i0, i1), tiles.i0, tiles.i1); ++x) {
         const TileId id{level, x, y};
         auto mode = reader_.void_mode(id);
         if (!mode) return mode.error();
@@ -99,11 +106,13 @@ class LmdbLayerStore final : public LayerStore {
  private:
   Result<void> check(int level, const PostWindow& window) const {
     if (level < 0 || level > info_.base_level) {
-      return Error{ErrorCode::kNotFound, "layer " + info_.name + " stores levels 0 to " + std::to_string(info_.base_level) +
-                                             ", level " + std::to_string(level) + " was asked for"};
+      return Error{ErrorCode::kNotFound, "layer " + info_.name + " stores levels 0 to " +
+                                             std::to_string(info_.base_level) + ", level " +
+                                             std::to_string(level) + " was asked for"};
     }
     if (window.is_empty() || window.width() > kMaxWindowPosts / window.height()) {
-      return Error{ErrorCode::kTooLarge, "layer " + info_.name + ": a window holds 1 to " + std::to_string(kMaxWindowPosts) + " posts"};
+      return Error{ErrorCode::kTooLarge, "layer " + info_.name + ": a window holds 1 to " +
+                                             std::to_string(kMaxWindowPosts) + " posts"};
     }
     return {};
   }
@@ -119,7 +128,8 @@ std::filesystem::path layer_directory(const std::filesystem::path& data_dir, con
   return data_dir / "layers" / name;
 }
 
-Result<std::filesystem::path> current_generation(const std::filesystem::path& data_dir, const std::string& name) {
+Result<std::filesystem::path> current_generation(const std::filesystem::path& data_dir,
+                                                 const std::string& name) {
   if (auto ok = check_name("layer", name); !ok) return ok.error();
   const std::filesystem::path directory = layer_directory(data_dir, name);
   std::ifstream in(directory / "CURRENT");
@@ -132,7 +142,8 @@ Result<std::filesystem::path> current_generation(const std::filesystem::path& da
   }
   std::getline(in, generation);
   if (!check_name("generation", generation)) {
-    return Error{ErrorCode::kCorrupt, (directory / "CURRENT").string() + " names no generation; ingest the layer again"};
+    return Error{ErrorCode::kCorrupt,
+                 (directory / "CURRENT").string() + " names no generation; ingest the layer again"};
   }
   return directory / generation;
 }
@@ -149,11 +160,14 @@ Result<void> sync_directory(const std::filesystem::path& directory) {
 Result<void> replace_file(const std::filesystem::path& file, const std::string& text) {
   const std::filesystem::path temporary = file.string() + ".tmp";
   const int fd = ::open(temporary.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
-  const bool is_written = fd >= 0 && ::write(fd, text.data(), text.size()) == static_cast<ssize_t>(text.size()) && ::fsync(fd) == 0;
+  const bool is_written = fd >= 0 &&
+                          ::write(fd, text.data(), text.size()) == static_cast<ssize_t>(text.size()) &&
+                          ::fsync(fd) == 0;
   const int reason = errno;
   if (fd >= 0) ::close(fd);
   if (!is_written || ::rename(temporary.c_str(), file.c_str()) != 0) {
-    const Error error{ErrorCode::kIo, file.string() + " cannot be written: " + std::strerror(is_written ? errno : reason)};
+    const Error error{ErrorCode::kIo,
+                      file.string() + " cannot be written: " + std::strerror(is_written ? errno : reason)};
     ::unlink(temporary.c_str());
     return error;
   }
@@ -164,18 +178,23 @@ Result<LayerInfo> read_layer_info(const LmdbEnv& env) {
   std::optional<Result<std::string>> text;
   auto found = env.read(kInfoKey, [&](ByteView value) { text = decode_text(value, kInfoKey); });
   if (!found) return found.error();
-  if (!*found) return Error{ErrorCode::kCorrupt, env.file().string() + ": layer info is missing; ingest the layer again"};
-  if (!*text) return Error{ErrorCode::kCorrupt, env.file().string() + ": layer info: " + text->error().message + "; ingest the layer again"};
+  if (!*found)
+    return Error{ErrorCode::kCorrupt,
+                 env.file().string() + ": layer info is missing; ingest the layer again"};
+  if (!*text)
+    return Error{ErrorCode::kCorrupt,
+                 env.file().string() + ": layer info: " + text->error().message + "; ingest the layer again"};
   return layer_info_from_json(**text);
 }
 
-std::shared_ptr<LayerStore> store_on(std::shared_ptr<const LmdbEnv> env, LayerInfo info, std::string roughness,
-                                     std::size_t decoded_bytes) {
-  return std::make_shared<LmdbLayerStore>(std::move(env), std::move(info), std::move(roughness), decoded_bytes);
+std::shared_ptr<LayerStore> store_on(std::shared_ptr<const LmdbEnv> env, LayerInfo info,
+                                     std::string roughness, std::size_t decoded_bytes) {
+  return std::make_shared<LmdbLayerStore>(std::move(env), std::move(info), std::move(roughness),
+                                          decoded_bytes);
 }
 
-Result<std::shared_ptr<LayerStore>> LayerStore::open(const std::filesystem::path& data_dir, const std::string& name,
-                                                     std::size_t decoded_bytes) {
+Result<std::shared_ptr<LayerStore>> LayerStore::open(const std::filesystem::path& data_dir,
+                                                     const std::string& name, std::size_t decoded_bytes) {
   auto generation = current_generation(data_dir, name);
   if (!generation) return generation.error();
   auto env = LmdbEnv::open(*generation, LmdbEnv::Mode::kFrozen);
@@ -190,10 +209,12 @@ Result<std::shared_ptr<LayerStore>> LayerStore::open(const std::filesystem::path
   auto info = read_layer_info(**env);
   if (!info) return std::move(info.error()).within("opening layer " + name);
   std::optional<Result<std::string>> roughness;
-  auto found = (*env)->read(kRoughnessKey, [&](ByteView value) { roughness = decode_text(value, kRoughnessKey); });
+  auto found =
+      (*env)->read(kRoughnessKey, [&](ByteView value) { roughness = decode_text(value, kRoughnessKey); });
   if (!found) return found.error();
   if (*found && !*roughness) {
-    return Error{ErrorCode::kCorrupt, (*env)->file().string() + ": roughness: " + roughness->error().message + "; ingest the layer again"};
+    return Error{ErrorCode::kCorrupt, (*env)->file().string() + ": roughness: " + roughness->error().message +
+                                          "; ingest the layer again"};
   }
   return store_on(*env, std::move(*info), *found ? **roughness : std::string(), decoded_bytes);
 }
@@ -201,10 +222,12 @@ Result<std::shared_ptr<LayerStore>> LayerStore::open(const std::filesystem::path
 std::vector<std::string> list_layers(const std::filesystem::path& data_dir) {
   std::vector<std::string> names;
   std::error_code ec;
-  for (std::filesystem::directory_iterator it(data_dir / "layers", ec), end; !ec && it != end; it.increment(ec)) {
+  for (std::filesystem::directory_iterator it(data_dir / "layers", ec), end; !ec && it != end;
+       it.increment(ec)) {
     std::error_code ignored;
     const std::string name = it->path().filename().string();
-    if (check_name("layer", name) && std::filesystem::exists(it->path() / "CURRENT", ignored)) names.push_back(name);
+    if (check_name("layer", name) && std::filesystem::exists(it->path() / "CURRENT", ignored))
+      names.push_back(name);
   }
   std::sort(names.begin(), names.end());
   return names;

@@ -3,12 +3,15 @@
 #include <sys/mman.h>
 
 #include <algorithm>
+#include <cstdio>
 #include <cstring>
+#include <fstream>
 
 namespace lodestone {
 namespace {
 
-// After so many bytes read, mapped pages are let go: they stay in the page cache, but not in our resident set.
+// After so many bytes read, mapped pages are let go: they stay in the page cache, but not in our resident
+// set.
 constexpr std::size_t kForgetEveryBytes = std::size_t{64} << 20;
 constexpr unsigned kMaxReaders = 1024;
 
@@ -24,14 +27,16 @@ MDB_val val(const void* data, std::size_t size) { return {size, const_cast<void*
 Error LmdbEnv::failure(int code, const char* what) const {
   const bool is_damage = code == MDB_CORRUPTED || code == MDB_PAGE_NOTFOUND || code == MDB_INVALID ||
                          code == MDB_VERSION_MISMATCH || code == MDB_PANIC;
-  const std::string fix = code == ENOSPC        ? "; free disk space and try again"
+  const std::string fix = code == ENOSPC         ? "; free disk space and try again"
                           : code == MDB_MAP_FULL ? "; the store is full"
                           : is_damage            ? "; ingest the layer again"
                                                  : "";
-  return Error{is_damage ? ErrorCode::kCorrupt : ErrorCode::kIo, file_.string() + ": " + what + ": " + mdb_strerror(code) + fix};
+  return Error{is_damage ? ErrorCode::kCorrupt : ErrorCode::kIo,
+               file_.string() + ": " + what + ": " + mdb_strerror(code) + fix};
 }
 
-Result<std::shared_ptr<LmdbEnv>> LmdbEnv::open(const std::filesystem::path& directory, Mode mode, std::size_t map_bytes) {
+Result<std::shared_ptr<LmdbEnv>> LmdbEnv::open(const std::filesystem::path& directory, Mode mode,
+                                               std::size_t map_bytes) {
   std::shared_ptr<LmdbEnv> self(new LmdbEnv);
   self->file_ = directory / "data.mdb";
   std::error_code ec;
@@ -50,7 +55,8 @@ Result<std::shared_ptr<LmdbEnv>> LmdbEnv::open(const std::filesystem::path& dire
   unsigned flags = MDB_NOTLS;
   if (mode == Mode::kFrozen) flags |= MDB_RDONLY | MDB_NOLOCK;
   if (mode == Mode::kBuild) flags |= MDB_NOSYNC | MDB_NOMETASYNC;
-  if (int code = mdb_env_open(self->env_, directory.c_str(), flags, 0644)) return self->failure(code, "opening");
+  if (int code = mdb_env_open(self->env_, directory.c_str(), flags, 0644))
+    return self->failure(code, "opening");
   MDB_txn* raw = nullptr;
   if (int code = mdb_txn_begin(self->env_, nullptr, mode == Mode::kFrozen ? MDB_RDONLY : 0, &raw)) {
     return self->failure(code, "opening");
@@ -63,16 +69,15 @@ Result<std::shared_ptr<LmdbEnv>> LmdbEnv::open(const std::filesystem::path& dire
   MDB_stat stat{};
   mdb_env_info(self->env_, &info);
   mdb_env_stat(self->env_, &stat);
-  self->map_ = static_cast<const std::uint8_t*>(info.me_mapaddr);
-  self->map_bytes_ = info.me_mapsize;
   if (mode == Mode::kFrozen) {
     // Pages past the end of the file would be a SIGBUS; the header knows how many there must be.
     const std::uintmax_t needed = (static_cast<std::uintmax_t>(info.me_last_pgno) + 1) * stat.ms_psize;
     if (file_bytes < needed) {
-      return Error{ErrorCode::kCorrupt, self->file_.string() + ": " + std::to_string(needed) + " bytes expected, " +
-                                            std::to_string(file_bytes) + " found; ingest the layer again"};
+      return Error{ErrorCode::kCorrupt, self->file_.string() + ": " + std::to_string(needed) +
+                                            " bytes expected, " + std::to_string(file_bytes) +
+                                            " found; ingest the layer again"};
     }
-    self->map_bytes_ = std::min<std::size_t>(self->map_bytes_, file_bytes);
+    self->frozen_bytes_ = file_bytes;
   }
   return self;
 }
@@ -108,7 +113,23 @@ Result<void> LmdbEnv::sync() {
 
 bool LmdbEnv::is_inside(const MDB_val& value) const {
   const auto* begin = static_cast<const std::uint8_t*>(value.mv_data);
-  return begin >= map_ && value.mv_size <= map_bytes_ && static_cast<std::size_t>(begin - map_) <= map_bytes_ - value.mv_size;
+  // LMDB does not tell where its map lies; the kernel does, for the first value read.
+  std::call_once(is_located_, [&] {
+    const auto address = reinterpret_cast<std::uintptr_t>(begin);
+    std::ifstream maps("/proc/self/maps");
+    for (std::string line; std::getline(maps, line);) {
+      unsigned long long from = 0, to = 0;
+      if (std::sscanf(line.c_str(), "%llx-%llx", &from, &to) != 2 || address < from || address >= to)
+        continue;
+      if (line.find("/data.mdb") == std::string::npos) break;
+      map_ = reinterpret_cast<const std::uint8_t*>(static_cast<std::uintptr_t>(from));
+      map_bytes_ = to - from;
+      if (frozen_bytes_ > 0) map_bytes_ = std::min<std::size_t>(map_bytes_, frozen_bytes_);
+    }
+  });
+  if (map_ == nullptr) return false;
+  return begin >= map_ && value.mv_size <= map_bytes_ &&
+         static_cast<std::size_t>(begin - map_) <= map_bytes_ - value.mv_size;
 }
 
 void LmdbEnv::forget_pages(std::size_t read_bytes) const {
@@ -145,7 +166,8 @@ Result<void> LmdbEnv::for_each(const std::function<bool(std::string_view, ByteVi
   int code = 0;
   while ((code = mdb_cursor_get(cursor, &key, &value, MDB_NEXT)) == 0) {
     if (!is_inside(value) || !is_inside(key)) return failure(MDB_CORRUPTED, "reading");
-    if (!use({static_cast<const char*>(key.mv_data), key.mv_size}, {static_cast<const std::uint8_t*>(value.mv_data), value.mv_size})) {
+    if (!use({static_cast<const char*>(key.mv_data), key.mv_size},
+             {static_cast<const std::uint8_t*>(value.mv_data), value.mv_size})) {
       return {};
     }
     forget_pages(value.mv_size);

@@ -8,6 +8,7 @@
 #include <filesystem>
 #include <functional>
 #include <memory>
+#include <mutex>
 #include <span>
 #include <string>
 #include <vector>
@@ -20,7 +21,9 @@ using ByteView = std::span<const std::uint8_t>;
 inline ByteView bytes_of(std::string_view text) {
   return {reinterpret_cast<const std::uint8_t*>(text.data()), text.size()};
 }
-inline std::string_view text_of(ByteView bytes) { return {reinterpret_cast<const char*>(bytes.data()), bytes.size()}; }
+inline std::string_view text_of(ByteView bytes) {
+  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+}
 
 struct KeyValue {
   std::string key;
@@ -37,7 +40,8 @@ class LmdbEnv {
     kDurable,  // a commit that returns is on disk
   };
   // Errors: kNotFound (no data file, kFrozen), kCorrupt (not LMDB, shorter than its own header says), kIo.
-  static Result<std::shared_ptr<LmdbEnv>> open(const std::filesystem::path& directory, Mode mode, std::size_t map_bytes = 0);
+  static Result<std::shared_ptr<LmdbEnv>> open(const std::filesystem::path& directory, Mode mode,
+                                               std::size_t map_bytes = 0);
   ~LmdbEnv();
   LmdbEnv(const LmdbEnv&) = delete;
   LmdbEnv& operator=(const LmdbEnv&) = delete;
@@ -60,8 +64,10 @@ class LmdbEnv {
   std::filesystem::path file_;
   MDB_env* env_ = nullptr;
   MDB_dbi dbi_ = 0;
-  const std::uint8_t* map_ = nullptr;
-  std::size_t map_bytes_ = 0;
+  std::uintmax_t frozen_bytes_ = 0;  // length of a published file; 0: still growing
+  mutable std::once_flag is_located_;
+  mutable const std::uint8_t* map_ = nullptr;  // both set under is_located_
+  mutable std::size_t map_bytes_ = 0;
   mutable std::atomic<std::size_t> read_bytes_{0};
 };
 

@@ -1,5 +1,6 @@
 #pragma once
-// run_jobs: jobs on worker threads, their outputs consumed on the calling thread, with a bound on what waits in between.
+// run_jobs: jobs on worker threads, their outputs consumed on the calling thread, with a bound on what waits
+// in between.
 
 #include <atomic>
 #include <condition_variable>
@@ -16,13 +17,15 @@
 
 namespace lodestone {
 
-// work(job, worker, emit) runs on `threads` threads for job = 0..count-1, begun in that order; emit(output) hands one output over
-// and returns false when the work should stop. consume(output) runs on the calling thread, in any order of outputs.
-// The first error, of either, ends everything and is returned; an exception of a worker becomes kInternal.
+// work(job, worker, emit) runs on `threads` threads for job = 0..count-1, begun in that order; emit(output)
+// hands one output over and returns false when the work should stop. consume(output) runs on the calling
+// thread, in any order of outputs. The first error, of either, ends everything and is returned; an exception
+// of a worker becomes kInternal.
 template <class Output>
-Result<void> run_jobs(std::int64_t count, int threads, std::size_t max_waiting,
-                      const std::function<Result<void>(std::int64_t, int, const std::function<bool(Output&&)>&)>& work,
-                      const std::function<Result<void>(Output&&)>& consume) {
+Result<void> run_jobs(
+    std::int64_t count, int threads, std::size_t max_waiting,
+    const std::function<Result<void>(std::int64_t, int, const std::function<bool(Output&&)>&)>& work,
+    const std::function<Result<void>(Output&&)>& consume) {
   std::mutex mutex;  // guards waiting, running, failure
   std::condition_variable is_changed;
   std::deque<Output> waiting;
@@ -37,7 +40,7 @@ Result<void> run_jobs(std::int64_t count, int threads, std::size_t max_waiting,
     is_stopped = true;
     is_changed.notify_all();
   };
-  const std::function<bool(Output&&)> emit = [&](Output&& output) {
+  const std::function<bool(Output &&)> emit = [&](Output&& output) {
     std::unique_lock lock(mutex);
     is_changed.wait(lock, [&] { return is_stopped || waiting.size() < max_waiting; });
     if (is_stopped) return false;

@@ -35,11 +35,12 @@ class QuietGdal {
 struct PlannedRaster {
   std::string path;
   std::int64_t width = 0, height = 0;
-  bool flip_x = false, flip_y = false;   // columns run west, rows run north in the file
-  std::int64_t i0 = 0, j0 = 0;           // post of the layer's base level under the first (flipped) pixel
-  double nodata = 0;                     // in raw values
-  bool has_nodata = false, has_mask = false, is_wide = false;  // is_wide: float32 would lose bits of the raw values
-  double scale = 1, offset = 0;          // metres = (raw * scale + offset) * unit_m
+  bool flip_x = false, flip_y = false;  // columns run west, rows run north in the file
+  std::int64_t i0 = 0, j0 = 0;          // post of the layer's base level under the first (flipped) pixel
+  double nodata = 0;                    // in raw values
+  bool has_nodata = false, has_mask = false,
+       is_wide = false;          // is_wide: float32 would lose bits of the raw values
+  double scale = 1, offset = 0;  // metres = (raw * scale + offset) * unit_m
   double unit_m = 1;
   int block_width = 0, block_height = 0;
 };
@@ -58,7 +59,8 @@ Result<RasterPlan> plan_rasters(const IngestOptions& options);
 class RasterReader {
  public:
   static Result<RasterReader> open(const RasterPlan& plan);
-  // Metres of base-level posts `window` (inside the world), NaN where no source has data. The span holds width * height floats.
+  // Metres of base-level posts `window` (inside the world), NaN where no source has data. The span holds
+  // width * height floats.
   Result<void> read(const PostWindow& window, std::vector<float>& heights_m);
 
  private:

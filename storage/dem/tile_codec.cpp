@@ -53,7 +53,8 @@ std::uint32_t append_packed(std::vector<std::uint8_t>& out, std::span<const std:
   thread_local const std::unique_ptr<ZSTD_CCtx, ZstdCloser> context(ZSTD_createCCtx());
   const std::size_t at = out.size();
   out.resize(at + ZSTD_compressBound(raw.size()));
-  const std::size_t size = ZSTD_compressCCtx(context.get(), out.data() + at, out.size() - at, raw.data(), raw.size(), kZstdLevel);
+  const std::size_t size =
+      ZSTD_compressCCtx(context.get(), out.data() + at, out.size() - at, raw.data(), raw.size(), kZstdLevel);
   assert(!ZSTD_isError(size) && "zstd failed in a buffer of its own bound");
   out.resize(at + size);
   return static_cast<std::uint32_t>(size);
@@ -61,7 +62,8 @@ std::uint32_t append_packed(std::vector<std::uint8_t>& out, std::span<const std:
 
 bool unpack(std::span<const std::uint8_t> packed, std::span<std::uint8_t> raw) {
   thread_local const std::unique_ptr<ZSTD_DCtx, ZstdCloser> context(ZSTD_createDCtx());
-  const std::size_t size = ZSTD_decompressDCtx(context.get(), raw.data(), raw.size(), packed.data(), packed.size());
+  const std::size_t size =
+      ZSTD_decompressDCtx(context.get(), raw.data(), raw.size(), packed.data(), packed.size());
   return !ZSTD_isError(size) && size == raw.size();
 }
 
@@ -76,7 +78,8 @@ bool is_int16(std::span<const float> h) {
   return ok;
 }
 
-// Differences along the row (the first post of a row: from the one above), zigzag, split into planes of bytes, low first.
+// Differences along the row (the first post of a row: from the one above), zigzag, split into planes of
+// bytes, low first.
 template <class U>
 void to_planes(std::span<const U> v, std::size_t width, std::vector<std::uint8_t>& planes) {
   const std::size_t n = v.size();
@@ -97,7 +100,8 @@ void from_planes(std::span<const std::uint8_t> planes, std::size_t width, std::s
     U before = row != 0 ? v[row - width] : U{0};
     for (std::size_t k = row; k < row + width; ++k) {
       U z = 0;
-      for (std::size_t b = 0; b < sizeof(U); ++b) z = static_cast<U>(z | static_cast<U>(static_cast<U>(planes[b * n + k]) << (8 * b)));
+      for (std::size_t b = 0; b < sizeof(U); ++b)
+        z = static_cast<U>(z | static_cast<U>(static_cast<U>(planes[b * n + k]) << (8 * b)));
       const U d = static_cast<U>((z >> 1) ^ static_cast<U>(-(z & 1)));
       before = static_cast<U>(before + d);
       v[k] = before;
@@ -109,12 +113,15 @@ Error damaged(const std::string& what) { return Error{ErrorCode::kCorrupt, "tile
 
 Result<Header> read_header(std::span<const std::uint8_t> value, std::uint64_t seed) {
   if (value.size() < kPrefix) {
-    return damaged("at least " + std::to_string(kPrefix) + " bytes expected, " + std::to_string(value.size()) + " found");
+    return damaged("at least " + std::to_string(kPrefix) + " bytes expected, " +
+                   std::to_string(value.size()) + " found");
   }
   Header h{};
   std::memcpy(&h, value.data(), sizeof h);
-  if (std::memcmp(h.magic, kTileMagic, 4) != 0 || h.version != kVersion) return damaged("wrong magic or version");
-  if (h.header_check != static_cast<std::uint32_t>(XXH3_64bits_withSeed(value.data(), kCheckedHeader, seed))) {
+  if (std::memcmp(h.magic, kTileMagic, 4) != 0 || h.version != kVersion)
+    return damaged("wrong magic or version");
+  if (h.header_check !=
+      static_cast<std::uint32_t>(XXH3_64bits_withSeed(value.data(), kCheckedHeader, seed))) {
     return damaged("header checksum differs");
   }
   return h;
@@ -156,7 +163,8 @@ std::vector<std::uint8_t> encode_tile(const HeightGrid& tile, std::string_view k
     h.encoding = kInt16;
     thread_local std::vector<std::uint16_t> v;
     v.resize(n);
-    for (std::size_t k = 0; k < n; ++k) v[k] = static_cast<std::uint16_t>(static_cast<std::int32_t>(tile.heights_m[k]));
+    for (std::size_t k = 0; k < n; ++k)
+      v[k] = static_cast<std::uint16_t>(static_cast<std::int32_t>(tile.heights_m[k]));
     to_planes<std::uint16_t>(v, width, planes);
     h.height_bytes = append_packed(out, planes);
   } else {
@@ -168,13 +176,15 @@ std::vector<std::uint8_t> encode_tile(const HeightGrid& tile, std::string_view k
     h.height_bytes = append_packed(out, planes);
   }
 
-  const auto voids = static_cast<std::size_t>(std::count(tile.is_void.begin(), tile.is_void.end(), std::uint8_t{1}));
+  const auto voids =
+      static_cast<std::size_t>(std::count(tile.is_void.begin(), tile.is_void.end(), std::uint8_t{1}));
   if (voids == n && n > 0) {
     h.void_mode = static_cast<std::uint8_t>(VoidMode::kAll);
   } else if (voids > 0) {
     h.void_mode = static_cast<std::uint8_t>(VoidMode::kSome);
     std::vector<std::uint8_t> bits((n + 7) / 8);
-    for (std::size_t k = 0; k < n; ++k) bits[k / 8] = static_cast<std::uint8_t>(bits[k / 8] | (tile.is_void[k] << (k % 8)));
+    for (std::size_t k = 0; k < n; ++k)
+      bits[k / 8] = static_cast<std::uint8_t>(bits[k / 8] | (tile.is_void[k] << (k % 8)));
     h.void_bytes = append_packed(out, bits);
   }
 
@@ -186,7 +196,8 @@ std::vector<std::uint8_t> encode_tile(const HeightGrid& tile, std::string_view k
   return out;
 }
 
-Result<HeightGrid> decode_tile(std::span<const std::uint8_t> value, std::string_view key, const PostWindow& window) {
+Result<HeightGrid> decode_tile(std::span<const std::uint8_t> value, std::string_view key,
+                               const PostWindow& window) {
   const std::uint64_t seed = key_seed(key);
   auto header = read_header(value, seed);
   if (!header) return header.error();
@@ -195,10 +206,12 @@ Result<HeightGrid> decode_tile(std::span<const std::uint8_t> value, std::string_
   std::memcpy(&check, value.data() + sizeof(Header), sizeof check);
   if (check != body_check(value, seed)) return damaged("checksum differs");
   if (h.width != window.width() || h.height != window.height()) {
-    return damaged(std::to_string(window.width()) + " x " + std::to_string(window.height()) + " posts expected, " +
-                   std::to_string(h.width) + " x " + std::to_string(h.height) + " found");
+    return damaged(std::to_string(window.width()) + " x " + std::to_string(window.height()) +
+                   " posts expected, " + std::to_string(h.width) + " x " + std::to_string(h.height) +
+                   " found");
   }
-  if (kPrefix + std::size_t{h.height_bytes} + h.void_bytes != value.size()) return damaged("sizes do not add up");
+  if (kPrefix + std::size_t{h.height_bytes} + h.void_bytes != value.size())
+    return damaged("sizes do not add up");
 
   HeightGrid tile;
   tile.window = window;
@@ -216,7 +229,8 @@ Result<HeightGrid> decode_tile(std::span<const std::uint8_t> value, std::string_
     thread_local std::vector<std::uint16_t> v;
     v.resize(n);
     from_planes<std::uint16_t>(planes, h.width, v);
-    for (std::size_t k = 0; k < n; ++k) tile.heights_m[k] = static_cast<float>(static_cast<std::int16_t>(v[k]));
+    for (std::size_t k = 0; k < n; ++k)
+      tile.heights_m[k] = static_cast<float>(static_cast<std::int16_t>(v[k]));
   } else if (h.encoding == kFloatBits) {
     planes.resize(n * 4);
     if (!unpack(packed, planes)) return damaged("heights do not unpack");
@@ -232,7 +246,8 @@ Result<HeightGrid> decode_tile(std::span<const std::uint8_t> value, std::string_
     tile.is_void.assign(n, 1);
   } else if (h.void_mode == static_cast<std::uint8_t>(VoidMode::kSome)) {
     std::vector<std::uint8_t> bits((n + 7) / 8);
-    if (!unpack(value.subspan(kPrefix + h.height_bytes, h.void_bytes), bits)) return damaged("void flags do not unpack");
+    if (!unpack(value.subspan(kPrefix + h.height_bytes, h.void_bytes), bits))
+      return damaged("void flags do not unpack");
     tile.is_void.resize(n);
     for (std::size_t k = 0; k < n; ++k) tile.is_void[k] = (bits[k / 8] >> (k % 8)) & 1;
   }

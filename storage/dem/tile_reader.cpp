@@ -6,14 +6,17 @@
 namespace lodestone {
 namespace {
 
-std::size_t bytes_in(const HeightGrid& tile) { return sizeof(HeightGrid) + 96 + tile.heights_m.size() * 4 + tile.is_void.size(); }
+std::size_t bytes_in(const HeightGrid& tile) {
+  return sizeof(HeightGrid) + 96 + tile.heights_m.size() * 4 + tile.is_void.size();
+}
 
 void copy_part(const HeightGrid& from, HeightGrid& to) {
   const PostWindow part = intersection(from.window, to.window);
   if (part.is_empty()) return;
   const auto n = static_cast<std::size_t>(part.width());
   for (std::int64_t j = part.j0; j <= part.j1; ++j) {
-    std::memcpy(&to.heights_m[to.index(part.i0, j)], &from.heights_m[from.index(part.i0, j)], n * sizeof(float));
+    std::memcpy(&to.heights_m[to.index(part.i0, j)], &from.heights_m[from.index(part.i0, j)],
+                n * sizeof(float));
   }
   if (from.is_void.empty()) return;
   if (to.is_void.empty()) to.is_void.assign(to.heights_m.size(), 0);
@@ -30,8 +33,8 @@ PostWindow stored_window(const LayerInfo& layer, const TileId& id) {
 
 Error TileReader::failed(Error error, const TileId& id) const {
   if (error.code == ErrorCode::kCorrupt) corrupt_values_.fetch_add(1, std::memory_order_relaxed);
-  return Error{error.code, "layer " + layer_.name + ", tile " + to_string(id) + " in " + env_->file().string() + ": " +
-                               error.message + "; ingest the layer again"};
+  return Error{error.code, "layer " + layer_.name + ", tile " + to_string(id) + " in " +
+                               env_->file().string() + ": " + error.message + "; ingest the layer again"};
 }
 
 Result<std::shared_ptr<const HeightGrid>> TileReader::tile(const TileId& id) const {
@@ -45,7 +48,8 @@ Result<std::shared_ptr<const HeightGrid>> TileReader::tile(const TileId& id) con
   }
   const std::string key = tile_key(id);
   std::optional<Result<HeightGrid>> decoded;
-  auto found = env_->read(key, [&](ByteView value) { decoded = decode_tile(value, key, stored_window(layer_, id)); });
+  auto found =
+      env_->read(key, [&](ByteView value) { decoded = decode_tile(value, key, stored_window(layer_, id)); });
   if (!found) return failed(std::move(found.error()), id);
   if (!*found) return failed(Error{ErrorCode::kCorrupt, "no such value stored"}, id);
   if (!*decoded) return failed(std::move(decoded->error()), id);
@@ -93,7 +97,8 @@ Result<HeightGrid> TileReader::window(int level, const PostWindow& window) const
       copy_part(**part, out);
     }
   }
-  if (std::find(out.is_void.begin(), out.is_void.end(), std::uint8_t{1}) == out.is_void.end()) out.is_void.clear();
+  if (std::find(out.is_void.begin(), out.is_void.end(), std::uint8_t{1}) == out.is_void.end())
+    out.is_void.clear();
   return out;
 }
 

@@ -1,8 +1,9 @@
 #pragma once
-// Fills void posts with nearby surveyed heights, by a rule that depends on the post alone, so that tiles agree on shared posts.
-// Source: SPEC-SYNTHESIS 3.6 (nearest valid height).
-//   within kFillReach posts:  the nearest surveyed post, Euclidean in posts; ties to the lowest row, then the lowest column
-//   farther away:             the mean of the nearest block (of 64 x 64 posts, or a power of two more) that has surveyed posts
+// Fills void posts with nearby surveyed heights, by a rule that depends on the post alone, so that tiles
+// agree on shared posts. Source: SPEC-SYNTHESIS 3.6 (nearest valid height).
+//   within kFillReach posts:  the nearest surveyed post, Euclidean in posts; ties to the lowest row, then the
+//   lowest column farther away:             the mean of the nearest block (of 64 x 64 posts, or a power of
+//   two more) that has surveyed posts
 
 #include <cstdint>
 #include <vector>
@@ -14,18 +15,21 @@ namespace lodestone {
 
 inline constexpr int kFillReach = 256;
 
-// Sums per block of the world, gathered while reading; then the fill of every block. Not thread-safe while adding.
+// Sums per block of the world, gathered while reading; then the fill of every block. Not thread-safe while
+// adding.
 class FillBlocks {
  public:
   explicit FillBlocks(const PostWindow& world);
-  // Partial sums of one read window, to be added on one thread. Whole 1/1024 m, so that the order of adding cannot matter.
+  // Partial sums of one read window, to be added on one thread. Whole 1/1024 m, so that the order of adding
+  // cannot matter.
   struct Part {
     std::int64_t block = 0;
     std::int64_t sum_1024 = 0;
     std::int64_t count = 0;
   };
   // Sums of the posts of `owned` in `grid` (NaN heights are void).
-  std::vector<Part> sums_of(const PostWindow& grid, const std::vector<float>& heights_m, const PostWindow& owned) const;
+  std::vector<Part> sums_of(const PostWindow& grid, const std::vector<float>& heights_m,
+                            const PostWindow& owned) const;
   void add(const std::vector<Part>& parts);
   // Call once, after all parts: finds each block's nearest block with data.
   void finish();
@@ -44,7 +48,8 @@ class FillBlocks {
   std::vector<float> fill_m_;
 };
 
-// Fills the void posts of `tile`. `around` holds heights and flags of tile.window grown by kFillReach, cut to the world.
+// Fills the void posts of `tile`. `around` holds heights and flags of tile.window grown by kFillReach, cut to
+// the world.
 void fill_voids(HeightGrid& tile, const HeightGrid& around, const FillBlocks& blocks);
 
 }  // namespace lodestone
