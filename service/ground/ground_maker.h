@@ -1,0 +1,60 @@
+#pragma once
+// GroundMaker: heights of any tile of any level, real or synthetic. One object per worker thread.
+
+#include <atomic>
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "kernels/device/device.h"
+#include "kernels/synthesis/wavelet_synthesis.h"
+#include "service/config/recipe.h"
+#include "service/ground/layer.h"
+
+namespace lodestone {
+
+enum Provenance : std::uint8_t { kSurveyed = 0, kFilled = 1, kSynthetic = 2 };
+
+// One tile's posts, row 0 north.
+struct Ground {
+  int posts = 0;
+  std::vector<float> heights_m;           // posts * posts
+  std::vector<std::uint8_t> provenance;   // posts * posts of Provenance; posts outside the data are kFilled
+  std::uint8_t provenance_bits = 0;       // bit n: some post is of Provenance n
+};
+
+struct GroundRequest {
+  std::shared_ptr<const Layer> layer;
+  Recipe recipe;
+  std::uint64_t seed = 0;
+  TileId id;
+};
+
+class GroundMaker {
+ public:
+  // device: null computes in plain C++ (device = "host"). Error: kDevice.
+  static Result<std::unique_ptr<GroundMaker>> create(std::shared_ptr<Device> device);
+
+  // Grounds of `requests`, in their order; tiles of equal depth share kernel launches. Each fails alone, with: kNotFound (no
+  // such tile), kCorrupt, kIo, kDevice.
+  std::vector<Result<Ground>> make(std::span<const GroundRequest> requests);
+
+ private:
+  explicit GroundMaker(std::unique_ptr<WaveletSynthesis> wavelet) : wavelet_(std::move(wavelet)) {}
+
+  Result<Ground> make_real(const GroundRequest& request);
+  void make_wavelet(std::span<const GroundRequest> requests, std::span<const std::size_t> which,
+                    std::vector<Result<Ground>>& grounds);
+
+  std::unique_ptr<WaveletSynthesis> wavelet_;
+};
+
+// The task of one synthetic tile (id.z > base level): reads the coarse heights, the maps and the masks that it needs.
+Result<WaveletTask> wavelet_task(const GroundRequest& request);
+
+// Heights and provenance for posts beyond the data: those of the nearest post of the data. `world`: the data's posts at the
+// level of `window`.
+void extend_beyond_data(const PostWindow& window, const PostWindow& world, Ground& ground);
+
+}  // namespace lodestone
