@@ -149,6 +149,11 @@ Result<std::unique_ptr<GroundMaker>> GroundMaker::create(std::shared_ptr<Device>
   return std::unique_ptr<GroundMaker>(new GroundMaker(std::move(*wavelet)));
 }
 
+Result<void> GroundMaker::probe(const WaveletTask& task) {
+  std::vector<float> heights;
+  return wavelet_->run(std::span(&task, 1), std::span(&heights, 1));
+}
+
 Result<Ground> GroundMaker::make_real(const GroundRequest& request) {
   const LayerInfo& info = request.layer->info();
   const PostWindow window = info.tile_window(request.id);

@@ -40,6 +40,9 @@ class GroundMaker {
   // such tile), kCorrupt, kIo, kDevice.
   std::vector<Result<Ground>> make(std::span<const GroundRequest> requests);
 
+  // Runs one task through the kernels and drops the heights: does the device still compute?
+  Result<void> probe(const WaveletTask& task);
+
  private:
   explicit GroundMaker(std::unique_ptr<WaveletSynthesis> wavelet) : wavelet_(std::move(wavelet)) {}
 

@@ -101,7 +101,9 @@ Result<std::shared_ptr<const Layer>> Layer::open(const std::filesystem::path& da
   if (!store) return store.error();
   auto masks = MaskStore::open(data_dir, (*store)->info());
   if (!masks) return masks.error();
-  const std::shared_ptr<Layer> layer(new Layer(*store, *masks, model_bytes));
+  auto crs = CrsTransform::create((*store)->info().crs_wkt);
+  if (!crs) return std::move(crs.error()).within("opening layer " + name);
+  const std::shared_ptr<Layer> layer(new Layer(*store, *masks, *crs, model_bytes));
   const std::string stored = (*store)->roughness_json();
   if (!stored.empty()) {
     auto models = models_from_json(stored);
@@ -111,10 +113,17 @@ Result<std::shared_ptr<const Layer>> Layer::open(const std::filesystem::path& da
   return std::shared_ptr<const Layer>(layer);
 }
 
-Layer::Layer(std::shared_ptr<LayerStore> store, std::shared_ptr<MaskStore> masks, std::size_t model_bytes)
-    : store_(std::move(store)), masks_(std::move(masks)), mask_list_(masks_->list()), sigma_maps_(model_bytes) {
+Result<std::shared_ptr<const Layer>> Layer::over(std::shared_ptr<LayerStore> store, std::size_t model_bytes) {
+  auto crs = CrsTransform::create(store->info().crs_wkt);
+  if (!crs) return crs.error();
+  return std::shared_ptr<const Layer>(new Layer(std::move(store), nullptr, *crs, model_bytes));
+}
+
+Layer::Layer(std::shared_ptr<LayerStore> store, std::shared_ptr<MaskStore> masks, std::shared_ptr<CrsTransform> crs,
+             std::size_t model_bytes)
+    : store_(std::move(store)), masks_(std::move(masks)), crs_(std::move(crs)), mask_list_(masks_ ? masks_->list() : std::vector<MaskInfo>()), sigma_maps_(model_bytes) {
   const std::string text = fmt::format("{}|{}|{}|{}|{}", kFormatVersion, layer_info_json(info()), store_->roughness_json(),
-                                       masks_->digest(), kernel_source_hash());
+                                       masks_ ? masks_->digest() : 0, kernel_source_hash());
   revision_ = fmt::format("{:016x}", XXH3_64bits(text.data(), text.size()));
 }
 

@@ -11,6 +11,7 @@
 
 #include "service/config/recipe.h"
 #include "service/ground/roughness_models.h"
+#include "storage/dem/crs_transform.h"
 #include "storage/dem/layer_store.h"
 #include "storage/dem/mask_store.h"
 
@@ -47,9 +48,12 @@ class Layer {
   static Result<std::shared_ptr<const Layer>> open(const std::filesystem::path& data_dir, const std::string& name,
                                                    std::size_t decoded_bytes, std::size_t model_bytes);
 
+  // A layer without masks over any store (evaluation, tests). Error: the store's CRS is not understood.
+  static Result<std::shared_ptr<const Layer>> over(std::shared_ptr<LayerStore> store, std::size_t model_bytes);
+
   const LayerInfo& info() const { return store_->info(); }
   const LayerStore& store() const { return *store_; }
-  MaskStore& masks() const { return *masks_; }
+  MaskStore& masks() const { return *masks_; }  // not of a layer made by over()
   // 16 hexadecimal digits over source data, grid, options, masks, kernel and format version.
   const std::string& revision() const { return revision_; }
   const std::vector<MaskInfo>& mask_list() const { return mask_list_; }
@@ -57,16 +61,19 @@ class Layer {
   // The model for these parameters: stored with the layer, or computed now and kept.
   Result<std::shared_ptr<const RoughnessModel>> model(const LsaParameters& parameters) const;
   SigmaMapCache& sigma_maps() const { return sigma_maps_; }
+  CrsTransform& crs() const { return *crs_; }
 
   // The layer's masks that a recipe names ("*": all), sorted. Names that the layer does not have are left out: one recipe
   // serves layers with and without roads.
   std::vector<std::string> resolve_masks(const std::vector<std::string>& names) const;
 
  private:
-  Layer(std::shared_ptr<LayerStore> store, std::shared_ptr<MaskStore> masks, std::size_t model_bytes);
+  Layer(std::shared_ptr<LayerStore> store, std::shared_ptr<MaskStore> masks, std::shared_ptr<CrsTransform> crs,
+        std::size_t model_bytes);
 
   const std::shared_ptr<LayerStore> store_;
-  const std::shared_ptr<MaskStore> masks_;
+  const std::shared_ptr<MaskStore> masks_;  // null: over()
+  const std::shared_ptr<CrsTransform> crs_;
   std::vector<MaskInfo> mask_list_;
   std::string revision_;
   mutable SigmaMapCache sigma_maps_;

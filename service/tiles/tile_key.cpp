@@ -110,6 +110,7 @@ std::string TileKey::text() const {
       break;
     case TileFormat::kF32:
     case TileFormat::kTif:
+    case TileFormat::kGround:
       break;
   }
   return out + fmt::format("|{}", quantum_m);
@@ -190,6 +191,7 @@ std::string_view content_type(TileFormat format) {
     case TileFormat::kTif:
       return "image/tiff";
     case TileFormat::kF32:
+    case TileFormat::kGround:
       break;
   }
   return "application/octet-stream";

@@ -18,7 +18,8 @@
 
 namespace lodestone {
 
-enum class TileFormat : std::uint8_t { kExr, kF32, kTif, kPng };
+// kGround is for our own use (/heights): the f32 tile followed by one Provenance byte per post.
+enum class TileFormat : std::uint8_t { kExr, kF32, kTif, kPng, kGround };
 
 struct TileKey {
   std::shared_ptr<const Layer> layer;

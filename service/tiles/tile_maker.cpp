@@ -118,11 +118,17 @@ Result<TileMaker::Made> TileMaker::encode(const TileKey& key, Ground& ground) {
     made.ground_ms = ms_since(start);
   }
   const auto start = Clock::now();
-  if (key.quantum_m > 0) quantise(ground.heights_m, key.quantum_m);
+  if (key.quantum_m > 0) {
+    if (auto ok = quantise(ground.heights_m, key.quantum_m); !ok) return ok.error();
+  }
   Result<std::string> body = std::string();
   switch (key.format) {
     case TileFormat::kF32:
       body = encode_f32_tile(ground.heights_m);
+      break;
+    case TileFormat::kGround:
+      body = encode_f32_tile(ground.heights_m);
+      body->append(ground.provenance.begin(), ground.provenance.end());
       break;
     case TileFormat::kExr: {
       const std::span<const std::uint8_t> provenance =

@@ -53,8 +53,15 @@ TileService::~TileService() {
   if (watcher_.joinable()) watcher_.join();
 }
 
-TileService::Ticket TileService::get(const TileKey& key, Priority priority, Callback callback) {
-  const CacheKey hash = key.hash();
+void TileService::post(std::function<void(TileMaker&)> job) {
+  {
+    const std::lock_guard lock(mutex_);
+    jobs_.push_back(std::move(job));
+  }
+  wake_.notify_one();
+}
+
+TileService::Ticket TileService::get(const TileKey& key, const CacheKey& hash, Priority priority, Callback callback) {
   TileAnswer answer;
   if (CachedTilePtr hit = memory_->get(hash)) {
     answer.tile = std::move(hit);
@@ -122,11 +129,17 @@ void TileService::leave(Ticket ticket) {
   }
 }
 
-std::vector<TileService::FlightPtr> TileService::next_batch() {
+TileService::Work TileService::next_work() {
   std::unique_lock lock(mutex_);
-  wake_.wait(lock, [&] { return is_stopping_ || queued_ > 0; });
-  std::vector<FlightPtr> batch;
-  if (is_stopping_) return batch;
+  wake_.wait(lock, [&] { return is_stopping_ || queued_ > 0 || !jobs_.empty(); });
+  Work work;
+  if (is_stopping_) return work;
+  if (!jobs_.empty()) {
+    work.job = std::move(jobs_.front());
+    jobs_.pop_front();
+    return work;
+  }
+  std::vector<FlightPtr>& batch = work.batch;
   // The other workers get their share before this one takes a second tile.
   const std::size_t share = (queued_ + threads_.size() - 1) / std::max<std::size_t>(1, threads_.size());
   const std::size_t most = std::min<std::size_t>(static_cast<std::size_t>(options_.batch_tiles), std::max<std::size_t>(1, share));
@@ -140,7 +153,7 @@ std::vector<TileService::FlightPtr> TileService::next_batch() {
     if (!batch.empty()) break;  // one priority per batch: a looked-at tile never waits for a precomputed one
   }
   running_ += batch.size();
-  return batch;
+  return work;
 }
 
 bool TileService::is_wanted(const FlightPtr& flight) const {
@@ -203,10 +216,13 @@ void TileService::serve(TileMaker& maker, const std::vector<FlightPtr>& batch) {
 }
 
 void TileService::work(TileMaker& maker) {
-  for (auto batch = next_batch(); !batch.empty(); batch = next_batch()) {
-    serve(maker, batch);
-    running_ -= batch.size();
-    batch.clear();
+  for (Work work = next_work(); work.job || !work.batch.empty(); work = next_work()) {
+    if (work.job) {
+      work.job(maker);
+      continue;
+    }
+    serve(maker, work.batch);
+    running_ -= work.batch.size();
     const std::lock_guard lock(mutex_);
     idle_.notify_all();
   }

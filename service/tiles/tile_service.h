@@ -62,9 +62,12 @@ class TileService {
   using Ticket = std::uint64_t;
 
   // Calls back once: at once on a memory hit or a full queue (kOverloaded), else from a worker. Never blocks on disk or compute.
-  Ticket get(const TileKey& key, Priority priority, Callback callback);
+  Ticket get(const TileKey& key, Priority priority, Callback callback) { return get(key, key.hash(), priority, std::move(callback)); }
+  Ticket get(const TileKey& key, const CacheKey& hash, Priority priority, Callback callback);  // hash == key.hash()
+  // Runs `job` on a worker before any waiting tile. Dropped when the service stops.
+  void post(std::function<void(TileMaker&)> job);
   // The waiter leaves; its callback will not run any more (it may be running). When the last one of a tile leaves, queued work
-  // is dropped, and running work stops before its next stage.
+  // is dropped, and running work is not started on the kernels if it has not been yet.
   void leave(Ticket ticket);
 
   // Waits until nothing is queued or running, at most `limit`. True if so.
@@ -106,7 +109,11 @@ class TileService {
   TileService(const TileServiceOptions& options);
   void work(TileMaker& maker);
   void watch();
-  std::vector<FlightPtr> next_batch();  // blocks; empty at the end
+  struct Work {
+    std::vector<FlightPtr> batch;
+    std::function<void(TileMaker&)> job;
+  };
+  Work next_work();  // blocks; both empty at the end
   void serve(TileMaker& maker, const std::vector<FlightPtr>& batch);
   void finish(const FlightPtr& flight, const TileAnswer& answer);
   bool is_wanted(const FlightPtr& flight) const;
@@ -122,6 +129,7 @@ class TileService {
   mutable std::mutex mutex_;  // guards all below
   std::condition_variable wake_, idle_, watch_wake_;
   std::array<std::deque<FlightPtr>, kPriorities> queues_;
+  std::deque<std::function<void(TileMaker&)>> jobs_;
   std::size_t queued_ = 0;
   std::unordered_map<CacheKey, FlightPtr, KeyHash> flights_;
   std::unordered_map<Ticket, FlightPtr> tickets_;
