@@ -12,6 +12,7 @@
 
 #include "service/app/app.h"
 #include "service/cli/commands.h"
+#include "service/http/problem.h"
 
 namespace lodestone {
 namespace {
