@@ -2,7 +2,6 @@
 
 #include <fmt/format.h>
 
-#define TOML_EXCEPTIONS 0
 #include <toml++/toml.h>
 
 #include <algorithm>
@@ -86,12 +85,13 @@ Result<void> read_recipe(Options& options, const std::string& file, const std::s
 }
 
 Result<void> read_file(Options& options, const std::string& file) {
-  const toml::parse_result parsed = toml::parse_file(file);
-  if (!parsed) {
-    const auto& error = parsed.error();
+  toml::table parsed;
+  try {
+    parsed = toml::parse_file(file);
+  } catch (const toml::parse_error& error) {
     return bad(fmt::format("{}: {}", place(file, error.source()), error.description()));
   }
-  for (const auto& [key, value] : parsed.table()) {
+  for (const auto& [key, value] : parsed) {
     const std::string name(key.str());
     if (name == "recipes") {
       const auto* recipes = value.as_table();
