@@ -21,7 +21,8 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
 
   Result<void> run(std::span<const FractalTask> tasks, std::span<std::vector<float>> heights_m) override {
     for (std::size_t n = 0; n < tasks.size(); ++n) {
-      if (Result<void> ok = check(tasks[n]); !ok) return std::move(ok.error()).within("task " + std::to_string(n));
+      if (Result<void> ok = check(tasks[n]); !ok)
+        return std::move(ok.error()).within("task " + std::to_string(n));
       try {
         run_one(tasks[n], heights_m[n]);
       } catch (const DeviceError& error) {
@@ -34,7 +35,8 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
  private:
   void run_one(const FractalTask& task, std::vector<float>& heights_m) {
     const FractalPlan plan = make_plan(task);
-    for (std::size_t slot = 0; slot < kSlotCount; ++slot) need(static_cast<FractalSlot>(slot), plan.floats[slot]);
+    for (std::size_t slot = 0; slot < kSlotCount; ++slot)
+      need(static_cast<FractalSlot>(slot), plan.floats[slot]);
     fill(kSlotHeightsA, plan.heights);
     fill(kSlotTable, plan.table);
     fill(kSlotKeep, plan.keep);
@@ -46,7 +48,8 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
     Mapped mapped(queue_.get(), planes_[plan.out].get(), CL_MAP_READ, last * sizeof(float));
     const float* from = static_cast<const float*>(mapped.data()) + LS_FRACTAL_GUARD + plan.out_at;
     for (std::size_t j = 0; j < posts; ++j)
-      std::copy(from + j * plan.out_pitch, from + j * plan.out_pitch + posts, heights_m.begin() + static_cast<std::ptrdiff_t>(j * posts));
+      std::copy(from + j * plan.out_pitch, from + j * plan.out_pitch + posts,
+                heights_m.begin() + static_cast<std::ptrdiff_t>(j * posts));
     mapped.release();
   }
 
@@ -55,10 +58,12 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
     const std::size_t size = floats + 2 * LS_FRACTAL_GUARD;
     if (floats == 0 || sizes_[slot] >= size) return;
     sizes_[slot] = 0;
-    planes_[slot] = make_buffer(device_->context(), CL_MEM_READ_WRITE | CL_MEM_ALLOC_HOST_PTR, size * sizeof(float));
+    planes_[slot] =
+        make_buffer(device_->context(), CL_MEM_READ_WRITE | CL_MEM_ALLOC_HOST_PTR, size * sizeof(float));
     sizes_[slot] = size;
     const float zero = 0;
-    LS_CL(clEnqueueFillBuffer(queue_.get(), planes_[slot].get(), &zero, sizeof(zero), 0, size * sizeof(float), 0, nullptr, nullptr));
+    LS_CL(clEnqueueFillBuffer(queue_.get(), planes_[slot].get(), &zero, sizeof(zero), 0, size * sizeof(float),
+                              0, nullptr, nullptr));
   }
 
   void fill(FractalSlot slot, const std::vector<float>& values) {
@@ -78,7 +83,8 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
     }
     const int per_item = op.kernel == kKernelNoise ? 16 : 1;
     launch(queue_.get(), kernel, static_cast<std::size_t>(device_->local_size()),
-           static_cast<std::size_t>((op.columns + per_item - 1) / per_item), static_cast<std::size_t>(op.rows));
+           static_cast<std::size_t>((op.columns + per_item - 1) / per_item),
+           static_cast<std::size_t>(op.rows));
   }
 
   const std::shared_ptr<Device> device_;

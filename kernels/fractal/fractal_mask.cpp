@@ -1,4 +1,5 @@
-// Mask factors of displacements: sqrt(1 - mask) at the point, 0 near hard pixels. SPEC-SYNTHESIS 4 carried over to points.
+// Mask factors of displacements: sqrt(1 - mask) at the point, 0 near hard pixels. SPEC-SYNTHESIS 4 carried
+// over to points.
 
 #include <algorithm>
 #include <cmath>
@@ -8,7 +9,8 @@
 namespace lodestone {
 namespace {
 
-// Pixels of one axis under point n: two for the bilinear value, and the range that the support meets. Relative to the crop.
+// Pixels of one axis under point n: two for the bilinear value, and the range that the support meets.
+// Relative to the crop.
 struct AxisPixels {
   int p0, p1;
   float f;
@@ -18,22 +20,29 @@ struct AxisPixels {
 std::vector<AxisPixels> axis_pixels(std::int64_t x0, int count, int shift, std::int64_t origin, int size) {
   std::vector<AxisPixels> axis(static_cast<std::size_t>(count));
   const int q = std::max(shift, 1);
-  const auto local = [&](std::int64_t p) { return static_cast<int>(std::clamp<std::int64_t>(p - origin, 0, size - 1)); };
+  const auto local = [&](std::int64_t p) {
+    return static_cast<int>(std::clamp<std::int64_t>(p - origin, 0, size - 1));
+  };
   const auto low = [&](std::int64_t v) { return shift >= 0 ? v >> shift : v * (std::int64_t{1} << -shift); };
-  const auto high = [&](std::int64_t v) { return shift >= 0 ? ceil_shift(v, shift) : v * (std::int64_t{1} << -shift); };
+  const auto high = [&](std::int64_t v) {
+    return shift >= 0 ? ceil_shift(v, shift) : v * (std::int64_t{1} << -shift);
+  };
   for (int n = 0; n < count; ++n) {
     const std::int64_t x = x0 + 2 * std::int64_t{n};
     const std::int64_t t = x * (std::int64_t{1} << (q - shift)) - (std::int64_t{1} << (q - 1));
     const std::int64_t p = t >> q;
-    const float f = static_cast<float>(t - p * (std::int64_t{1} << q)) / static_cast<float>(std::int64_t{1} << q);
-    axis[static_cast<std::size_t>(n)] = {local(p), local(p + 1), f, local(low(x - 3)), local(high(x + 3) - 1)};
+    const float f =
+        static_cast<float>(t - p * (std::int64_t{1} << q)) / static_cast<float>(std::int64_t{1} << q);
+    axis[static_cast<std::size_t>(n)] = {local(p), local(p + 1), f, local(low(x - 3)),
+                                         local(high(x + 3) - 1)};
   }
   return axis;
 }
 
 // Number of white pixels north-west of each pixel corner.
 std::vector<int> white_sums(const MaskCrop& mask) {
-  const std::size_t w = static_cast<std::size_t>(mask.width) + 1, h = static_cast<std::size_t>(mask.height) + 1;
+  const std::size_t w = static_cast<std::size_t>(mask.width) + 1,
+                    h = static_cast<std::size_t>(mask.height) + 1;
   std::vector<int> sums(w * h, 0);
   for (std::size_t j = 1; j < h; ++j) {
     int row = 0;
@@ -47,11 +56,13 @@ std::vector<int> white_sums(const MaskCrop& mask) {
 
 }  // namespace
 
-std::vector<float> mask_factors(const FractalTask& task, std::int64_t x0, std::int64_t y0, int shift, int columns, int rows, int pitch) {
+std::vector<float> mask_factors(const FractalTask& task, std::int64_t x0, std::int64_t y0, int shift,
+                                int columns, int rows, int pitch) {
   std::vector<float> keep(static_cast<std::size_t>(pitch) * static_cast<std::size_t>(rows), 1.0F);
   bool is_used = false;
   const auto any = [](const std::optional<MaskCrop>& mask) {
-    return mask && std::any_of(mask->pixels.begin(), mask->pixels.end(), [](std::uint8_t p) { return p != 0; });
+    return mask &&
+           std::any_of(mask->pixels.begin(), mask->pixels.end(), [](std::uint8_t p) { return p != 0; });
   };
   const auto apply = [&](const MaskCrop& mask, bool is_soft, bool is_hard) {
     const std::vector<AxisPixels> xs = axis_pixels(x0, columns, shift - mask.level, mask.i0, mask.width);

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cassert>
 #include <initializer_list>
+#include <tuple>
 #include <utility>
 
 #include "kernels/fractal/fractal_windows.h"
@@ -64,8 +65,8 @@ class Planner {
     const PostWindow known = coarse_window(task_);
     const Plane plane{kSlotHeightsA, all.i0, all.j0, static_cast<int>(all.width())};
     plan_.heights.assign(static_cast<std::size_t>(all.width() * all.height()), 0.0F);
-    const PostWindow common{std::max(all.i0, known.i0), std::max(all.j0, known.j0), std::min(all.i1, known.i1),
-                            std::min(all.j1, known.j1)};
+    const PostWindow common{std::max(all.i0, known.i0), std::max(all.j0, known.j0),
+                            std::min(all.i1, known.i1), std::min(all.j1, known.j1)};
     for (std::int64_t j = common.j0; j <= common.j1 && common.i1 >= common.i0; ++j) {
       const auto from = task_.coarse_m.begin() + (j - known.j0) * known.width() + (common.i0 - known.i0);
       std::copy(from, from + common.width(), plan_.heights.begin() + plane.at(common.i0, j));
@@ -145,10 +146,11 @@ class Planner {
     }
     g.i0 = static_cast<ls_uint>(w.i0 * (1 + square));
     g.j0 = static_cast<ls_uint>(w.j0 * (1 + square));
-    const ls_uint algo = square ? LS_ALGO_SQUARE_SQUARE
-                                : (task_.method == FractalMethod::kDiamondSquare ? LS_ALGO_DIAMOND_SQUARE : LS_ALGO_OSTROWSKI);
-    g.stream = ls_stream(static_cast<ls_uint>(task_.base_level + s_ + square), static_cast<ls_uint>(band), algo,
-                         static_cast<ls_uint>(task_.parameters.channel));
+    const ls_uint algo =
+        square ? LS_ALGO_SQUARE_SQUARE
+               : (task_.method == FractalMethod::kDiamondSquare ? LS_ALGO_DIAMOND_SQUARE : LS_ALGO_OSTROWSKI);
+    g.stream = ls_stream(static_cast<ls_uint>(task_.base_level + s_ + square), static_cast<ls_uint>(band),
+                         algo, static_cast<ls_uint>(task_.parameters.channel));
     return g;
   }
 
@@ -181,7 +183,8 @@ class Planner {
     table_step_ = s_;
     table_kind_ = node_kind;
     table_begin_ = plan_.table.size();
-    for (const NodeRoughness& node : task_.nodes.nodes) plan_.table.push_back(node_deviation(node, s_ + 1, node_kind));
+    for (const NodeRoughness& node : task_.nodes.nodes)
+      plan_.table.push_back(node_deviation(node, s_ + 1, node_kind));
     need(kSlotTable, plan_.table.size());
     return table_begin_;
   }
@@ -189,7 +192,8 @@ class Planner {
   void add_mask(const ls_step& band, FractalSlot slot) {
     if (!task_.mask && !task_.void_mask) return;
     const BandPlace place = band_place(task_, steps_[static_cast<std::size_t>(s_)], s_, band.band);
-    const std::vector<float> keep = mask_factors(task_, place.x0, place.y0, place.shift, band.width, band.height, band.pitch);
+    const std::vector<float> keep =
+        mask_factors(task_, place.x0, place.y0, place.shift, band.width, band.height, band.pitch);
     if (keep.empty()) return;
     ls_step g = band;
     g.table_at = static_cast<int>(plan_.keep.size());
@@ -234,7 +238,8 @@ class Planner {
     for (const FractalSlot slot :
          {kSlotWeight1, kSlotWeight2, kSlotWeight3, kSlotPosts, kSlotCentres, kSlotPosts2, kSlotCentres2})
       need(slot, size);
-    const ls_step horizontal = add_noise(1, kSlotDelta1), vertical = add_noise(2, kSlotDelta2), centre = add_noise(3, kSlotDelta3);
+    const ls_step horizontal = add_noise(1, kSlotDelta1), vertical = add_noise(2, kSlotDelta2),
+                  centre = add_noise(3, kSlotDelta3);
     const bool is_ruled = base_.has_altitude || base_.has_cap || base_.has_erosion;
 
     if (is_ruled) add(kKernelRuleCentres, centre, {from, kSlotDelta3});
@@ -243,12 +248,14 @@ class Planner {
     add(kKernelHalf1Posts, base_, {from, kSlotWeight3, kSlotPosts});
     add(kKernelHalf1Centres, base_, {kSlotPosts, kSlotDelta3, kSlotCentres});
 
-    for (const auto& [band, delta, weight] : {std::tuple{horizontal, kSlotDelta1, kSlotWeight1}, std::tuple{vertical, kSlotDelta2, kSlotWeight2}}) {
+    for (const auto& [band, delta, weight] : {std::tuple{horizontal, kSlotDelta1, kSlotWeight1},
+                                              std::tuple{vertical, kSlotDelta2, kSlotWeight2}}) {
       if (is_ruled) add(kKernelRuleEdges, band, {kSlotPosts, kSlotCentres, delta});
       add_mask(band, delta);
       add(kKernelWeights, band, {delta, weight});
     }
-    add(kKernelHalf2Old, base_, {kSlotPosts, kSlotCentres, kSlotWeight1, kSlotWeight2, kSlotPosts2, kSlotCentres2});
+    add(kKernelHalf2Old, base_,
+        {kSlotPosts, kSlotCentres, kSlotWeight1, kSlotWeight2, kSlotPosts2, kSlotCentres2});
     add(kKernelHalf2Quads, base_, {kSlotPosts2, kSlotCentres2, kSlotDelta1, kSlotDelta2, other(from)});
   }
 
@@ -268,10 +275,11 @@ FractalPlan make_plan(const FractalTask& task) { return Planner(task).make(); }
 
 const char* kernel_name(FractalKernel kernel) {
   constexpr std::array<const char*, kKernelCount> kNames = {
-      "ls_fractal_node_rows",     "ls_fractal_noise",         "ls_fractal_scale",        "ls_fractal_square_first",
-      "ls_fractal_square_next",   "ls_fractal_square_posts",  "ls_fractal_diamond_centres", "ls_fractal_diamond_quads",
-      "ls_fractal_rule_centres",  "ls_fractal_weights",       "ls_fractal_half1_posts",  "ls_fractal_half1_centres",
-      "ls_fractal_rule_edges",    "ls_fractal_half2_old",     "ls_fractal_half2_quads"};
+      "ls_fractal_node_rows",       "ls_fractal_noise",         "ls_fractal_scale",
+      "ls_fractal_square_first",    "ls_fractal_square_next",   "ls_fractal_square_posts",
+      "ls_fractal_diamond_centres", "ls_fractal_diamond_quads", "ls_fractal_rule_centres",
+      "ls_fractal_weights",         "ls_fractal_half1_posts",   "ls_fractal_half1_centres",
+      "ls_fractal_rule_edges",      "ls_fractal_half2_old",     "ls_fractal_half2_quads"};
   return kNames[kernel];
 }
 

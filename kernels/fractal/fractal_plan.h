@@ -1,5 +1,6 @@
 #pragma once
-// FractalPlan: a task unrolled into the operations that both backends carry out in the same order. Internal to the room.
+// FractalPlan: a task unrolled into the operations that both backends carry out in the same order. Internal
+// to the room.
 
 #include <array>
 #include <cstdint>
@@ -12,32 +13,41 @@ namespace lodestone {
 
 // Planes of floats. Each has LS_FRACTAL_GUARD unused floats before its first element and after its last.
 enum FractalSlot : std::uint8_t {
-  kSlotHeightsA, kSlotHeightsB,                 // levels, alternating; the data lies in A
-  kSlotDelta1, kSlotDelta2, kSlotDelta3,        // displacements: horizontal edges (or square-square), vertical edges, centres
-  kSlotWeight1, kSlotWeight2, kSlotWeight3,     // theta * displacement
-  kSlotPosts, kSlotCentres, kSlotPosts2, kSlotCentres2,
-  kSlotRows,                                    // node deviations along one row of items
-  kSlotTable, kSlotKeep,                        // whole task: node deviations; mask factors
+  kSlotHeightsA,
+  kSlotHeightsB,  // levels, alternating; the data lies in A
+  kSlotDelta1,
+  kSlotDelta2,
+  kSlotDelta3,  // displacements: horizontal edges (or square-square), vertical edges, centres
+  kSlotWeight1,
+  kSlotWeight2,
+  kSlotWeight3,  // theta * displacement
+  kSlotPosts,
+  kSlotCentres,
+  kSlotPosts2,
+  kSlotCentres2,
+  kSlotRows,  // node deviations along one row of items
+  kSlotTable,
+  kSlotKeep,  // whole task: node deviations; mask factors
   kSlotCount
 };
 
 // The kernels of fractal.cl, in its order; each takes an ls_step and then the planes of FractalOp::slots.
 enum FractalKernel : std::uint8_t {
-  kKernelNodeRows,       // table, rows
-  kKernelNoise,          // rows, delta
-  kKernelScale,          // keep, delta
-  kKernelSquareFirst,    // heights, delta, heights
-  kKernelSquareNext,     // heights, delta, heights
-  kKernelSquarePosts,    // heights, heights
-  kKernelDiamondCentres, // heights, delta, centres
-  kKernelDiamondQuads,   // heights, centres, delta, delta, heights
-  kKernelRuleCentres,    // heights, delta
-  kKernelWeights,        // delta, weight
-  kKernelHalf1Posts,     // heights, weight, posts
-  kKernelHalf1Centres,   // posts, delta, centres
-  kKernelRuleEdges,      // posts, centres, delta
-  kKernelHalf2Old,       // posts, centres, weight, weight, posts2, centres2
-  kKernelHalf2Quads,     // posts2, centres2, delta, delta, heights
+  kKernelNodeRows,        // table, rows
+  kKernelNoise,           // rows, delta
+  kKernelScale,           // keep, delta
+  kKernelSquareFirst,     // heights, delta, heights
+  kKernelSquareNext,      // heights, delta, heights
+  kKernelSquarePosts,     // heights, heights
+  kKernelDiamondCentres,  // heights, delta, centres
+  kKernelDiamondQuads,    // heights, centres, delta, delta, heights
+  kKernelRuleCentres,     // heights, delta
+  kKernelWeights,         // delta, weight
+  kKernelHalf1Posts,      // heights, weight, posts
+  kKernelHalf1Centres,    // posts, delta, centres
+  kKernelRuleEdges,       // posts, centres, delta
+  kKernelHalf2Old,        // posts, centres, weight, weight, posts2, centres2
+  kKernelHalf2Quads,      // posts2, centres2, delta, delta, heights
   kKernelCount
 };
 const char* kernel_name(FractalKernel kernel);
@@ -55,7 +65,7 @@ struct FractalPlan {
   std::array<std::size_t, kSlotCount> floats{};  // size of each plane without its guard
   std::vector<float> heights, table, keep;       // contents of kSlotHeightsA, kSlotTable, kSlotKeep
   FractalSlot out = kSlotHeightsA;
-  std::size_t out_at = 0, out_pitch = 0;         // where the tile's first post lies
+  std::size_t out_at = 0, out_pitch = 0;  // where the tile's first post lies
 };
 
 // task must pass check().
@@ -63,6 +73,7 @@ FractalPlan make_plan(const FractalTask& task);
 
 // Mask factors sqrt(1 - mask), 0 where a hard pixel is near, of columns x rows points: point (i, j) lies at
 // (x0 + 2i, y0 + 2j) * 2^-shift data cells from the world's corner. Empty when all are 1.
-std::vector<float> mask_factors(const FractalTask& task, std::int64_t x0, std::int64_t y0, int shift, int columns, int rows, int pitch);
+std::vector<float> mask_factors(const FractalTask& task, std::int64_t x0, std::int64_t y0, int shift,
+                                int columns, int rows, int pitch);
 
 }  // namespace lodestone

@@ -1,5 +1,6 @@
 #pragma once
-// FractalSynthesis: turns a batch of FractalTasks into heights, on an OpenCL device or in plain C++ with the same bits.
+// FractalSynthesis: turns a batch of FractalTasks into heights, on an OpenCL device or in plain C++ with the
+// same bits.
 
 #include <memory>
 #include <span>
@@ -16,8 +17,9 @@ class FractalSynthesis {
  public:
   virtual ~FractalSynthesis() = default;
 
-  // heights_m[n] gets task n's posts * posts heights, row 0 north, metres, as if cropped from the whole synthesised level.
-  // Posts outside the world are unspecified but finite. Errors: kInvalidArgument (a rule of FractalTask broken), kDevice.
+  // heights_m[n] gets task n's posts * posts heights, row 0 north, metres, as if cropped from the whole
+  // synthesised level. Posts outside the world are unspecified but finite. Errors: kInvalidArgument (a rule
+  // of FractalTask broken), kDevice.
   virtual Result<void> run(std::span<const FractalTask> tasks, std::span<std::vector<float>> heights_m) = 0;
 };
 

@@ -36,7 +36,8 @@ bool holds(const PostWindow& outer, const PostWindow& inner) {
   return outer.contains(inner.i0, inner.j0) && outer.contains(inner.i1, inner.j1);
 }
 
-Result<void> check_mask(const FractalTask& task, const std::optional<MaskCrop>& mask, const std::string& name) {
+Result<void> check_mask(const FractalTask& task, const std::optional<MaskCrop>& mask,
+                        const std::string& name) {
   if (!mask) return {};
   if (mask->level < -16 || mask->level > 16)
     return broken(name + " level must be -16..16, found " + std::to_string(mask->level));
@@ -51,19 +52,23 @@ Result<void> check_rules(const FractalParameters& p) {
   if (p.altitude) {
     const AltitudeRule& a = *p.altitude;
     if (!(a.z1_m > a.z0_m) || !std::isfinite(a.z0_m) || !std::isfinite(a.z1_m))
-      return broken("altitude must have finite z0 < z1, found " + std::to_string(a.z0_m) + " and " + std::to_string(a.z1_m));
+      return broken("altitude must have finite z0 < z1, found " + std::to_string(a.z0_m) + " and " +
+                    std::to_string(a.z1_m));
     if (!std::isfinite(a.lo) || !std::isfinite(a.hi)) return broken("altitude factors must be finite");
   }
-  if (p.cap_m && !(*p.cap_m >= 0)) return broken("cap must be 0 m or more, found " + std::to_string(*p.cap_m));
+  if (p.cap_m && !(*p.cap_m >= 0))
+    return broken("cap must be 0 m or more, found " + std::to_string(*p.cap_m));
   if (p.water_m && !std::isfinite(*p.water_m)) return broken("water level must be finite");
-  if (p.channel < 0 || p.channel > 255) return broken("channel must be 0..255, found " + std::to_string(p.channel));
+  if (p.channel < 0 || p.channel > 255)
+    return broken("channel must be 0..255, found " + std::to_string(p.channel));
   return {};
 }
 
 }  // namespace
 
 bool reads_heights(const FractalTask& task) {
-  return task.method == FractalMethod::kFractalWavelet && (task.parameters.altitude || task.parameters.erosion);
+  return task.method == FractalMethod::kFractalWavelet &&
+         (task.parameters.altitude || task.parameters.erosion);
 }
 
 std::vector<FractalStep> fractal_steps(const FractalTask& task) {
@@ -93,7 +98,8 @@ std::vector<FractalStep> fractal_steps(const FractalTask& task) {
 PostWindow coarse_window(const FractalTask& task) {
   PostWindow w = tile_window(task);
   if (task.method == FractalMethod::kFractalWavelet && !reads_heights(task))
-    w = {floor_shift(w.i0, task.depth), floor_shift(w.j0, task.depth), ceil_shift(w.i1, task.depth), ceil_shift(w.j1, task.depth)};
+    w = {floor_shift(w.i0, task.depth), floor_shift(w.j0, task.depth), ceil_shift(w.i1, task.depth),
+         ceil_shift(w.j1, task.depth)};
   else
     w = fractal_steps(task).front().needed;
   return clipped(w, task.world);
@@ -101,16 +107,19 @@ PostWindow coarse_window(const FractalTask& task) {
 
 BandPlace band_place(const FractalTask& task, const FractalStep& step, int s, int band) {
   if (band == 0) {
-    return {2 * (2 * step.items.i0 - (task.world.i0 << (s + 1))) + 1, 2 * (2 * step.items.j0 - (task.world.j0 << (s + 1))) + 1, s + 2};
+    return {2 * (2 * step.items.i0 - (task.world.i0 << (s + 1))) + 1,
+            2 * (2 * step.items.j0 - (task.world.j0 << (s + 1))) + 1, s + 2};
   }
-  return {2 * (step.items.i0 - (task.world.i0 << s)) + (band & 1), 2 * (step.items.j0 - (task.world.j0 << s)) + (band >> 1), s + 1};
+  return {2 * (step.items.i0 - (task.world.i0 << s)) + (band & 1),
+          2 * (step.items.j0 - (task.world.j0 << s)) + (band >> 1), s + 1};
 }
 
 std::int64_t node_coordinate(std::int64_t x0, int shift, int node_log2, NodeLookup lookup) {
   return lookup == NodeLookup::kSmooth ? x0 - (std::int64_t{1} << (shift + node_log2 - 1)) : x0;
 }
 
-NodeRange node_range(std::int64_t x0, int count, int shift, int node_log2, NodeLookup lookup, std::int64_t nodes) {
+NodeRange node_range(std::int64_t x0, int count, int shift, int node_log2, NodeLookup lookup,
+                     std::int64_t nodes) {
   const std::int64_t t = node_coordinate(x0, shift, node_log2, lookup);
   const int all = static_cast<int>(nodes);
   const int smooth = lookup == NodeLookup::kSmooth;
@@ -128,11 +137,12 @@ PostWindow node_window(const FractalTask& task, int node_log2) {
     const int per_item = is_square ? 2 : 1;
     for (int band = is_square ? 0 : 1; band <= (is_square ? 0 : 3); ++band) {
       const BandPlace place = band_place(task, step, s, band);
-      const NodeRange x = node_range(place.x0, static_cast<int>(step.items.width()) * per_item, place.shift, node_log2,
-                                     task.parameters.lookup, all.width());
-      const NodeRange y = node_range(place.y0, static_cast<int>(step.items.height()) * per_item, place.shift, node_log2,
-                                     task.parameters.lookup, all.height());
-      nodes = {std::min(nodes.i0, x.first), std::min(nodes.j0, y.first), std::max(nodes.i1, x.last), std::max(nodes.j1, y.last)};
+      const NodeRange x = node_range(place.x0, static_cast<int>(step.items.width()) * per_item, place.shift,
+                                     node_log2, task.parameters.lookup, all.width());
+      const NodeRange y = node_range(place.y0, static_cast<int>(step.items.height()) * per_item, place.shift,
+                                     node_log2, task.parameters.lookup, all.height());
+      nodes = {std::min(nodes.i0, x.first), std::min(nodes.j0, y.first), std::max(nodes.i1, x.last),
+               std::max(nodes.j1, y.last)};
     }
   }
   return nodes;
@@ -140,39 +150,55 @@ PostWindow node_window(const FractalTask& task, int node_log2) {
 
 PostWindow mask_window(const FractalTask& task, int mask_level) {
   const std::int64_t reach = reach_cells(task) + 2;  // and the support of a displacement there
-  const auto low = [&](std::int64_t x, std::int64_t origin) { return floor_shift(x, task.depth) - origin - reach; };
-  const auto high = [&](std::int64_t x, std::int64_t origin) { return ceil_shift(x, task.depth) - origin + reach; };
-  const auto pixel_low = [&](std::int64_t c) { return mask_level >= 0 ? c << mask_level : floor_shift(c, -mask_level); };
-  const auto pixel_high = [&](std::int64_t c) { return mask_level >= 0 ? c << mask_level : ceil_shift(c, -mask_level); };
+  const auto low = [&](std::int64_t x, std::int64_t origin) {
+    return floor_shift(x, task.depth) - origin - reach;
+  };
+  const auto high = [&](std::int64_t x, std::int64_t origin) {
+    return ceil_shift(x, task.depth) - origin + reach;
+  };
+  const auto pixel_low = [&](std::int64_t c) {
+    return mask_level >= 0 ? c << mask_level : floor_shift(c, -mask_level);
+  };
+  const auto pixel_high = [&](std::int64_t c) {
+    return mask_level >= 0 ? c << mask_level : ceil_shift(c, -mask_level);
+  };
   const PostWindow tile = tile_window(task);
   return {pixel_low(low(tile.i0, task.world.i0)) - 1, pixel_low(low(tile.j0, task.world.j0)) - 1,
           pixel_high(high(tile.i1, task.world.i0)), pixel_high(high(tile.j1, task.world.j0))};
 }
 
 Result<void> check(const FractalTask& task) {
-  if (task.world.width() < 2 || task.world.height() < 2) return broken("the world must have at least 2 x 2 posts");
-  if (task.depth < 1 || task.depth > kMaxDepth) return broken("depth must be 1.." + std::to_string(kMaxDepth) + ", found " + std::to_string(task.depth));
-  if (task.posts < 1 || task.posts > 2049) return broken("posts must be 1..2049, found " + std::to_string(task.posts));
+  if (task.world.width() < 2 || task.world.height() < 2)
+    return broken("the world must have at least 2 x 2 posts");
+  if (task.depth < 1 || task.depth > kMaxDepth)
+    return broken("depth must be 1.." + std::to_string(kMaxDepth) + ", found " + std::to_string(task.depth));
+  if (task.posts < 1 || task.posts > 2049)
+    return broken("posts must be 1..2049, found " + std::to_string(task.posts));
   if (task.base_level < 0 || task.base_level + task.depth > 255)
-    return broken("levels must be 0..255, found base " + std::to_string(task.base_level) + " and depth " + std::to_string(task.depth));
+    return broken("levels must be 0..255, found base " + std::to_string(task.base_level) + " and depth " +
+                  std::to_string(task.depth));
   constexpr std::int64_t kFar = std::int64_t{1} << 40;
   for (const std::int64_t v : {task.world.i0, task.world.j0, task.world.i1, task.world.j1})
-    if (v < -kFar || v > kFar) return broken("world indices must lie within 2^40, found " + std::to_string(v));
+    if (v < -kFar || v > kFar)
+      return broken("world indices must lie within 2^40, found " + std::to_string(v));
   for (const std::int64_t v : {task.x0 >> task.depth, task.y0 >> task.depth})
-    if (v < -kFar || v > kFar) return broken("tile indices must lie within 2^40 data posts, found " + std::to_string(v));
+    if (v < -kFar || v > kFar)
+      return broken("tile indices must lie within 2^40 data posts, found " + std::to_string(v));
   if (Result<void> rules = check_rules(task.parameters); !rules) return rules;
 
   const PostWindow coarse = coarse_window(task);
   if (task.coarse_m.size() != static_cast<std::size_t>(coarse.width() * coarse.height()))
-    return broken("coarse_m must hold coarse_window(), " + std::to_string(coarse.width() * coarse.height()) + " heights, found " +
-                  std::to_string(task.coarse_m.size()));
+    return broken("coarse_m must hold coarse_window(), " + std::to_string(coarse.width() * coarse.height()) +
+                  " heights, found " + std::to_string(task.coarse_m.size()));
   const NodeCrop& n = task.nodes;
   if (n.node_log2 < 2 || n.node_log2 > kMaxNodeLog2)
-    return broken("node_log2 must be 2.." + std::to_string(kMaxNodeLog2) + ", found " + std::to_string(n.node_log2));
+    return broken("node_log2 must be 2.." + std::to_string(kMaxNodeLog2) + ", found " +
+                  std::to_string(n.node_log2));
   const PostWindow all = layer_nodes(task.world, n.node_log2);
   if (n.layer_width != all.width() || n.layer_height != all.height())
-    return broken("the layer has " + std::to_string(all.width()) + " x " + std::to_string(all.height()) + " nodes, the crop says " +
-                  std::to_string(n.layer_width) + " x " + std::to_string(n.layer_height));
+    return broken("the layer has " + std::to_string(all.width()) + " x " + std::to_string(all.height()) +
+                  " nodes, the crop says " + std::to_string(n.layer_width) + " x " +
+                  std::to_string(n.layer_height));
   const PostWindow have{n.i0, n.j0, n.i0 + n.width - 1, n.j0 + n.height - 1};
   if (have.is_empty() || n.nodes.size() != static_cast<std::size_t>(have.width() * have.height()) ||
       !holds(have, node_window(task, n.node_log2)))

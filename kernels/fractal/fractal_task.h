@@ -1,6 +1,6 @@
 #pragma once
-// FractalTask: everything that midpoint displacement or the fractal wavelet needs for one tile, as plain values.
-// Sources: Hu & Wang; Ostrowski; SPEC-SYNTHESIS sections 5 and 6.
+// FractalTask: everything that midpoint displacement or the fractal wavelet needs for one tile, as plain
+// values. Sources: Hu & Wang; Ostrowski; SPEC-SYNTHESIS sections 5 and 6.
 
 #include <cstdint>
 #include <optional>
@@ -38,7 +38,8 @@ struct FractalParameters {
   bool operator==(const FractalParameters&) const = default;
 };
 
-// One tile: `posts` x `posts` output posts, the first at (x0, y0) of level base_level + depth. Any rectangle position is fine.
+// One tile: `posts` x `posts` output posts, the first at (x0, y0) of level base_level + depth. Any rectangle
+// position is fine.
 struct FractalTask {
   PostWindow world;  // the data at the base level, at least 2 x 2 posts
   int base_level = 0;
@@ -52,18 +53,20 @@ struct FractalTask {
   std::vector<float> coarse_m;  // heights of coarse_window(*this), row-major, finite
   NodeCrop nodes;               // holds node_window(*this)
 
-  // User mask (absent = all 0), void mask (cells with a void corner 255, level 0). Both hold mask_window(*this, level).
-  // A displacement is multiplied by sqrt(1 - mask), the mask bilinear between pixel centres at the point: its energy falls by
-  // the mask. White pixels of void_mask, and of mask in kProtect, are hard: a displacement whose support (three new posts to each
-  // side) meets one is dropped, so such a pixel, border included, holds the method's own refinement without displacement.
-  // Masking never changes the random numbers.
+  // User mask (absent = all 0), void mask (cells with a void corner 255, level 0). Both hold
+  // mask_window(*this, level). A displacement is multiplied by sqrt(1 - mask), the mask bilinear between
+  // pixel centres at the point: its energy falls by the mask. White pixels of void_mask, and of mask in
+  // kProtect, are hard: a displacement whose support (three new posts to each side) meets one is dropped, so
+  // such a pixel, border included, holds the method's own refinement without displacement. Masking never
+  // changes the random numbers.
   std::optional<MaskCrop> mask;
   MaskMode mask_mode = MaskMode::kAbsorb;
   std::optional<MaskCrop> void_mask;
 };
 
-// Base posts that the task needs, inside the world: coarse(x0 .. x0 + posts - 1, depth) and 1 post around for square-square,
-// 2 for diamond-square, 4 for the fractal wavelet with altitude or erosion rules, none for it without.
+// Base posts that the task needs, inside the world: coarse(x0 .. x0 + posts - 1, depth) and 1 post around for
+// square-square, 2 for diamond-square, 4 for the fractal wavelet with altitude or erosion rules, none for it
+// without.
 PostWindow coarse_window(const FractalTask& task);
 
 // Nodes that the task needs, within the layer; node_log2 2..kMaxNodeLog2.

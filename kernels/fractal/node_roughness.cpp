@@ -21,12 +21,14 @@ struct Residuals {
 };
 
 // Second differences along both axes at every post of the closed node.
-Residuals residuals(const HeightGrid& grid, const PostWindow& world, const PostWindow& node, std::int64_t tau) {
+Residuals residuals(const HeightGrid& grid, const PostWindow& world, const PostWindow& node,
+                    std::int64_t tau) {
   Residuals r;
   const auto add = [&](std::int64_t i, std::int64_t j, std::int64_t di, std::int64_t dj) {
     if (!world.contains(i - di, j - dj) || !world.contains(i + di, j + dj)) return;
     if (grid.void_at(i, j) || grid.void_at(i - di, j - dj) || grid.void_at(i + di, j + dj)) return;
-    const double mean = (static_cast<double>(grid.at(i - di, j - dj)) + static_cast<double>(grid.at(i + di, j + dj))) * 0.5;
+    const double mean =
+        (static_cast<double>(grid.at(i - di, j - dj)) + static_cast<double>(grid.at(i + di, j + dj))) * 0.5;
     const double d = static_cast<double>(grid.at(i, j)) - mean;
     r.sum_m2 += d * d;
     ++r.count;
@@ -85,20 +87,25 @@ double variogram(double distance2, double h) { return distance2 > 0 ? det_exp2(h
 }  // namespace
 
 PostWindow layer_nodes(const PostWindow& world, int node_log2) {
-  const auto count = [&](std::int64_t posts) { return std::max<std::int64_t>(1, ceil_shift(posts - 1, node_log2)); };
+  const auto count = [&](std::int64_t posts) {
+    return std::max<std::int64_t>(1, ceil_shift(posts - 1, node_log2));
+  };
   return {0, 0, count(world.width()) - 1, count(world.height()) - 1};
 }
 
 PostWindow node_heights_window(const PostWindow& nodes, const PostWindow& world, int node_log2) {
-  return {std::max(world.i0, world.i0 + (nodes.i0 << node_log2) - 4), std::max(world.j0, world.j0 + (nodes.j0 << node_log2) - 4),
+  return {std::max(world.i0, world.i0 + (nodes.i0 << node_log2) - 4),
+          std::max(world.j0, world.j0 + (nodes.j0 << node_log2) - 4),
           std::min(world.i1, world.i0 + ((nodes.i1 + 1) << node_log2) + 4),
           std::min(world.j1, world.j0 + ((nodes.j1 + 1) << node_log2) + 4)};
 }
 
-NodeCrop estimate_nodes(const HeightGrid& heights, const PostWindow& world, const PostWindow& nodes, int node_log2) {
+NodeCrop estimate_nodes(const HeightGrid& heights, const PostWindow& world, const PostWindow& nodes,
+                        int node_log2) {
   const PostWindow all = layer_nodes(world, node_log2);
-  NodeCrop crop{node_log2, nodes.i0, nodes.j0, static_cast<int>(nodes.width()), static_cast<int>(nodes.height()),
-                all.width(), all.height(), {}};
+  NodeCrop crop{
+      node_log2,   nodes.i0,     nodes.j0, static_cast<int>(nodes.width()), static_cast<int>(nodes.height()),
+      all.width(), all.height(), {}};
   crop.nodes.reserve(static_cast<std::size_t>(nodes.width() * nodes.height()));
   for (std::int64_t b = nodes.j0; b <= nodes.j1; ++b) {
     for (std::int64_t a = nodes.i0; a <= nodes.i1; ++a) {
@@ -106,7 +113,8 @@ NodeCrop estimate_nodes(const HeightGrid& heights, const PostWindow& world, cons
                             std::min(world.i1, world.i0 + ((a + 1) << node_log2)),
                             std::min(world.j1, world.j0 + ((b + 1) << node_log2))};
       std::array<Residuals, kScales> scales;
-      for (int l = 0; l < kScales; ++l) scales[static_cast<std::size_t>(l)] = residuals(heights, world, node, 1 << l);
+      for (int l = 0; l < kScales; ++l)
+        scales[static_cast<std::size_t>(l)] = residuals(heights, world, node, 1 << l);
       crop.nodes.push_back(fit(scales));
     }
   }
@@ -134,7 +142,8 @@ float node_deviation(const NodeRoughness& node, int n, NodeKind kind) {
   if (node.sigma_m <= 0) return 0;
   const double h = static_cast<double>(node.h);
   const double steps = kind == NodeKind::kWaveletCentre ? n - 0.5 : n;
-  return static_cast<float>(static_cast<double>(node.sigma_m) * det_exp2(-steps * h) * predictor_ratio(h, kind));
+  return static_cast<float>(static_cast<double>(node.sigma_m) * det_exp2(-steps * h) *
+                            predictor_ratio(h, kind));
 }
 
 }  // namespace lodestone
