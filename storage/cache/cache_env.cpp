@@ -18,7 +18,7 @@ constexpr const char* kDataFile = "data.mdb";
 constexpr const char* kLmdbLockFile = "lock.mdb";
 constexpr const char* kOwnerLockFile = "cache.lock";
 constexpr std::size_t kLockFileBytes = 65536;  // room for 1000 readers at a time
-constexpr std::uint64_t kMinMapBytes = std::uint64_t{1} << 20;
+constexpr std::uint64_t kSpareMapBytes = std::uint64_t{1} << 20;  // small caches need more than a quarter for the copies of a commit
 constexpr std::size_t kMaxInlineBytes = 1950;  // larger values get pages of their own (LMDB, 4096-byte pages)
 constexpr char kFormatKey[] = "format";        // in "settings": version, then kernel hash
 constexpr std::uint32_t kFormatVersion = 1;    // on disk: any change drops the caches of old versions
@@ -33,7 +33,7 @@ MDB_val val(std::string_view bytes) { return {bytes.size(), const_cast<char*>(by
 std::string_view view(const MDB_val& value) { return {static_cast<const char*>(value.mv_data), value.mv_size}; }
 
 std::uint64_t map_bytes(std::uint64_t budget_bytes) {
-  return std::max(kMinMapBytes, budget_bytes + budget_bytes / 4) / 65536 * 65536;
+  return (budget_bytes + budget_bytes / 4 + kSpareMapBytes) / 65536 * 65536;
 }
 
 // LMDB met a page that contradicts itself. It would abort the process; its assert hook may not return, so it throws.

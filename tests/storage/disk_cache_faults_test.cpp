@@ -14,6 +14,11 @@
 
 #include "tests/support/disk_cache_fixture.h"
 
+#ifdef __SANITIZE_THREAD__
+// The kill test's children start threads after fork, each in a copy of a process that has none of its own.
+extern "C" const char* __tsan_default_options() { return "die_after_fork=0"; }
+#endif
+
 namespace lodestone {
 namespace {
 

@@ -162,7 +162,8 @@ TEST_P(RandomDiskOperations, NeverGiveAWrongByteNorBreakTheBudget) {
   EXPECT_GT(hits, 100u);
   EXPECT_GT(evictions, 0u);
   EXPECT_EQ(cache->stats().corrupt, 0u) << cache->stats().last_error;
-  EXPECT_EQ(cache->stats().write_errors, 0u) << cache->stats().last_error;
+  EXPECT_EQ(cache->stats().write_errors, 0u);
+  EXPECT_EQ(cache->stats().last_error, "");  // never so full that it had to start anew
   cache.reset();
   const Result<DiskCacheReport> report = verify_disk_cache(directory(), false);
   ASSERT_TRUE(report) << report.error().message;
