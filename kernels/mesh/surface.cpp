@@ -103,6 +103,11 @@ void add_skirt(TinMesh& mesh, float depth_m) {
     if (!is_border) continue;
     const std::uint32_t a_low = lowered(a), b_low = lowered(b);
     mesh.triangles.insert(mesh.triangles.end(), {a_low, b_low, b, a_low, b, a});
+    if (!mesh.zones.empty()) mesh.zones.insert(mesh.zones.end(), 2, mesh.zones[k / 3]);
+    if (!mesh.blend.empty()) {
+      const float at_a = mesh.blend[k], at_b = mesh.blend[k % 3 == 2 ? k - 2 : k + 1];
+      mesh.blend.insert(mesh.blend.end(), {at_a, at_b, at_b, at_a, at_b, at_a});
+    }
   }
 }
 

@@ -33,8 +33,8 @@ struct TinMesh {
 
   std::vector<TinVertex> vertices;
   std::vector<std::uint32_t> triangles;  // 3 per triangle, counter-clockwise seen from above with north up
-  std::vector<std::uint16_t> zones;      // one per top triangle, or empty
-  std::vector<float> blend;              // 3 per top triangle: share 0..1 of second_zone() at its corners; or empty
+  std::vector<std::uint16_t> zones;      // one per triangle, or empty
+  std::vector<float> blend;              // 3 per triangle: share 0..1 of second_zone() at its corners; or empty
   std::vector<float> normals;            // 3 per vertex: east, north, up, unit length; or empty
 
   // Vertices and triangles from these indices on are skirt; the top surface comes first.
