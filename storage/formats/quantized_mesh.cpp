@@ -19,14 +19,14 @@ double dot(const Vec3& a, const Vec3& b) { return a[0] * b[0] + a[1] * b[1] + a[
 Vec3 cross(const Vec3& a, const Vec3& b) { return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]}; }
 
 // Point on the line from the Earth's centre through `centre` that is below the horizon only when every position is; scaled so that
-// the ellipsoid is the unit sphere. A tile that spans too much for one gets a point that is never hidden.
+// the ellipsoid is the unit sphere. A tile of half the Earth has no such point and gets one far out.
 Vec3 horizon_occlusion_point(const std::vector<Vec3>& positions, std::size_t count, const Vec3& centre) {
   constexpr Vec3 kRadii{6378137.0, 6378137.0, 6356752.3142451793};
-  constexpr double kNeverHidden = 1e6;
+  constexpr double kFarOut = 1e6;
   const auto scaled = [&](const Vec3& p) { return Vec3{p[0] / kRadii[0], p[1] / kRadii[1], p[2] / kRadii[2]}; };
   Vec3 direction = scaled(centre);
   const double size = length(direction);
-  if (size <= 0) return {kNeverHidden, 0, 0};
+  if (size <= 0) return {kFarOut, 0, 0};
   for (double& x : direction) x /= size;
   double magnitude = 0;
   for (std::size_t i = 0; i < count; ++i) {
@@ -37,10 +37,10 @@ Vec3 horizon_occlusion_point(const std::vector<Vec3>& positions, std::size_t cou
     const double cos_alpha = dot(p, direction), sin_alpha = length(cross(p, direction));
     const double cos_beta = 1 / above, sin_beta = std::sqrt(above * above - 1) * cos_beta;
     const double denominator = cos_alpha * cos_beta - sin_alpha * sin_beta;
-    magnitude = denominator > 1 / kNeverHidden ? std::max(magnitude, 1 / denominator) : kNeverHidden;
-    if (magnitude >= kNeverHidden) break;
+    magnitude = denominator > 1 / kFarOut ? std::max(magnitude, 1 / denominator) : kFarOut;
+    if (magnitude >= kFarOut) break;
   }
-  magnitude = std::min(magnitude, kNeverHidden);
+  magnitude = std::min(magnitude, kFarOut);
   return {direction[0] * magnitude, direction[1] * magnitude, direction[2] * magnitude};
 }
 
