@@ -39,8 +39,14 @@ LS_FN float ls_mix(float a, float b, float f) { return a + f * (b - a); }
 #define LS_MASK_ENERGY_MIXED 276  /* D of bands 1 and 2: 46 * 6 */
 #define LS_MASK_ENERGY_DIAGONAL 2116 /* D of band 3: 46 * 46 */
 #define LS_MASK_PROTECTS (1 << 22)
-#define LS_MASK_PIXEL_VALUE 0x7fff   /* of a source entry: 0..1020 */
-#define LS_MASK_PIXEL_PROTECTS 0x8000
+/* A source entry: 0..1020 and a flag high enough that sums of values stay below the flags they collect. */
+#define LS_MASK_PIXEL_VALUE 0xffff
+#define LS_MASK_PIXEL_PROTECTS (1 << 16)
+/* Sum of weights times entries along x -> the form that is summed along y. */
+LS_FN int ls_mask_folded(int sum) { return (sum & LS_MASK_PIXEL_VALUE) + (sum > LS_MASK_PIXEL_VALUE ? LS_MASK_PROTECTS : 0); }
+/* Record of one row of coefficients in the mask tables: first source row, their number n <= 6 (0: nothing to remove in the row),
+   n weights as bytes in two words, first and end column that the mask can reach. */
+#define LS_MASK_RECORD 6
 
 /* Weight of source entry number n (0..5) for a coefficient. Fine cells X-3..X+2 in the odd direction, X-2..X+1 in the even one
    (each vertex of the squared taps 1 4 36 4 1 or 1 4 1 shares its value among its two cells), or, for a source of vertices,
@@ -90,8 +96,8 @@ enum {
   LS_H_MASK_X,        /* fine column of relative index 0, counted from the first fine column of the source */
   LS_H_MASK_SHIFT,    /* fine columns per source entry, log2 */
   LS_H_MASK_VERTICES, /* 1: the source has one entry per fine vertex */
-  LS_H_MASK_USED_AT,  /* per source row: 0 if it is all 0 */
-  LS_H_MASK_ROWS_ODD_AT, /* per row: first source row, their number n <= 6, n weights as bytes in two words */
+  LS_H_MASK_USED_AT,  /* per source row: first and end column whose sum is read */
+  LS_H_MASK_ROWS_ODD_AT, /* LS_MASK_RECORD words per row */
   LS_H_MASK_ROWS_EVEN_AT,
   LS_H_MASK_SUMS_ODD_AT, /* in the mask-sum buffer: MASK_HEIGHT rows of STRIDE + 16 ints */
   LS_H_MASK_SUMS_EVEN_AT,

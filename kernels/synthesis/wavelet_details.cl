@@ -26,24 +26,26 @@ LS_KERNEL void ls_sigma_rows(__global const uint* parameters, __global float* si
   for (int row = 0; row < height; ++row) out[row * stride] = ls_mix(map[row * width + entry], map[row * width + next], f);
 }
 
-/* One column of mask sums. */
-LS_FN void ls_sum_column(__global const uint* parameters, __global const uint* h, __global int* out, int stride, int x, int odd) {
+/* One column of mask sums; column: the one it stands for in a row without repeats. */
+LS_FN void ls_sum_column(__global const uint* parameters, __global const uint* h, __global int* out, int stride, int column, int x, int odd) {
   const int vertices = h[LS_H_MASK_VERTICES], shift = h[LS_H_MASK_SHIFT], width = h[LS_H_MASK_WIDTH], height = h[LS_H_MASK_HEIGHT];
-  const int n = ls_mask_count(odd, vertices);
+  const int n = ls_mask_count(odd, vertices), first = x >> shift, second = (x + n - 1) >> shift;
   __global const uint* source = parameters + h[LS_H_MASK_AT];
-  __global const uint* used = parameters + h[LS_H_MASK_USED_AT];
-  for (int row = 0; row < height; ++row, source += width) {
-    if (!used[row]) {
-      out[row * stride] = 0;
-      continue;
-    }
-    int sum = 0, flags = 0;
-    for (int k = 0; k < n; ++k) {
-      const int pixel = source[(x + k) >> shift];
-      sum += ls_mask_weight(k, odd, vertices) * (pixel & LS_MASK_PIXEL_VALUE);
-      flags |= pixel & LS_MASK_PIXEL_PROTECTS;
-    }
-    out[row * stride] = sum + (flags ? LS_MASK_PROTECTS : 0);
+  __global const int* span = (__global const int*)(parameters + h[LS_H_MASK_USED_AT]);
+  const bool is_narrow = second - first < 2; /* coarse pixels: at most two under the filter */
+  int weight0 = 0, weight1 = 0;
+  for (int k = 0; k < n; ++k) {
+    const int weight = ls_mask_weight(k, odd, vertices);
+    if ((x + k) >> shift == first) weight0 += weight;
+    else weight1 += weight;
+  }
+  for (int row = 0; row < height; ++row, source += width, span += 2, out += stride) {
+    if (column < span[0] || column >= span[1]) continue;
+    int sum = 0;
+    if (is_narrow) sum = weight0 * (int)source[first] + weight1 * (int)source[second];
+    else
+      for (int k = 0; k < n; ++k) sum += ls_mask_weight(k, odd, vertices) * (int)source[(x + k) >> shift];
+    *out = ls_mask_folded(sum);
   }
 }
 
@@ -52,29 +54,33 @@ LS_KERNEL void ls_mask_rows(__global const uint* parameters, __global int* mask_
   __global const uint* h = parameters + get_global_id(1) * LS_HEADER_WORDS;
   const int column = get_global_id(0), stride = h[LS_H_STRIDE] + 16;
   if (h[LS_H_MASK_AT] == 0 || column >= stride) return;
-  const int vertices = h[LS_H_MASK_VERTICES], x = h[LS_H_MASK_X];
+  const int vertices = h[LS_H_MASK_VERTICES], x = h[LS_H_MASK_X], plain = column < stride - 16 ? column : column - (stride - 16);
   const int odd_x = x + 2 * (int)parameters[h[LS_H_COLUMNS_ODD_AT] + column] + 1 + ls_mask_first(1, vertices);
   const int even_x = x + 2 * (int)parameters[h[LS_H_COLUMNS_EVEN_AT] + column] + ls_mask_first(0, vertices);
-  ls_sum_column(parameters, h, mask_sums + h[LS_H_MASK_SUMS_ODD_AT] + column, stride, odd_x, 1);
-  ls_sum_column(parameters, h, mask_sums + h[LS_H_MASK_SUMS_EVEN_AT] + column, stride, even_x, 0);
+  ls_sum_column(parameters, h, mask_sums + h[LS_H_MASK_SUMS_ODD_AT] + column, stride, plain, odd_x, 1);
+  ls_sum_column(parameters, h, mask_sums + h[LS_H_MASK_SUMS_EVEN_AT] + column, stride, plain, even_x, 0);
 }
 
-/* Mask energy of sixteen coefficients of one row: sums at the block's first column, `row` as MaskRow. */
-LS_FN int16 ls_mask_block(__global const uint* row, __global const int* sums, uint stride) {
-  const uint first = row[0], n = row[1];
-  uint weights = row[2];
+/* Mask energy of sixteen coefficients of one row (a record), the first one in `column`: `sums` are those of the first source row. */
+LS_FN int16 ls_mask_block(__global const uint* record, __global const int* sums, uint stride, int column) {
   int16 total = (int16)(0);
-  for (uint k = 0; k < n; ++k) {
-    total += (int)(weights & 255u) * vload16(0, sums + (first + k) * stride);
-    weights = k == 3 ? row[3] : weights >> 8;
+  const uint n = record[1];
+  if (n == 0 || column + 16 <= (int)record[4] || column >= (int)record[5]) return total;
+  uint weights = record[2];
+  sums += record[0] * stride;
+  for (uint k = 0; k < n; ++k, sums += stride) {
+    total += (int)(weights & 255u) * vload16(0, sums);
+    weights = k == 3 ? record[3] : weights >> 8;
   }
   return total;
 }
 
-/* The same for a block whose lanes `next` lie in the following row. */
-LS_FN int16 ls_mask_lanes(__global const uint* rows, uint row, __global const int* sums, uint stride, int16 next, bool crosses) {
-  const int16 here = ls_mask_block(rows + row * 4, sums, stride);
-  return crosses ? select(here, ls_mask_block(rows + (row + 1) * 4, sums, stride), next) : here;
+/* The same for a block whose lanes `next` lie in the following row: there it starts `column - columns` before the first one. */
+LS_FN int16 ls_mask_lanes(__global const uint* rows, uint row, __global const int* sums, uint columns, int column, int16 next) {
+  __global const uint* record = rows + row * LS_MASK_RECORD;
+  const int16 here = ls_mask_block(record, sums + column, columns + 16, column);
+  if (column + 16 <= (int)columns) return here;
+  return select(here, ls_mask_block(record + LS_MASK_RECORD, sums + column, columns + 16, column - (int)columns), next);
 }
 
 /* LSA deviation of sixteen coefficients: rows of (entry, fraction), sigma rows at the block's first column. */
@@ -146,13 +152,13 @@ LS_KERNEL void ls_details(__global const uint* parameters, __global const float*
   __global float* out = detail + h[LS_H_DETAIL_AT] + block * 16;
   const uint plane = h[LS_H_PLANE];
   if (h[LS_H_MASK_AT] != 0) {
-    __global const int* sums_odd = mask_sums + h[LS_H_MASK_SUMS_ODD_AT] + column;
-    __global const int* sums_even = mask_sums + h[LS_H_MASK_SUMS_EVEN_AT] + column;
+    __global const int* sums_odd = mask_sums + h[LS_H_MASK_SUMS_ODD_AT];
+    __global const int* sums_even = mask_sums + h[LS_H_MASK_SUMS_EVEN_AT];
     __global const uint* mask_odd = parameters + h[LS_H_MASK_ROWS_ODD_AT];
     __global const uint* mask_even = parameters + h[LS_H_MASK_ROWS_EVEN_AT];
-    const int16 s1 = ls_mask_lanes(mask_even, row, sums_odd, stride + 16, next, crosses);
-    const int16 s2 = ls_mask_lanes(mask_odd, row, sums_even, stride + 16, next, crosses);
-    const int16 s3 = ls_mask_lanes(mask_odd, row, sums_odd, stride + 16, next, crosses);
+    const int16 s1 = ls_mask_lanes(mask_even, row, sums_odd, stride, column, next);
+    const int16 s2 = ls_mask_lanes(mask_odd, row, sums_even, stride, column, next);
+    const int16 s3 = ls_mask_lanes(mask_odd, row, sums_odd, stride, column, next);
     if (ls_or16(s1 | s2 | s3)) {
       ls_store_band(out, sigma1, i_odd, j_even, stream | 1u << 8, k0, k1, s1, LS_MASK_FULL * LS_MASK_ENERGY_MIXED);
       ls_store_band(out + plane, sigma2, i_even, j_odd, stream | 2u << 8, k0, k1, s2, LS_MASK_FULL * LS_MASK_ENERGY_MIXED);

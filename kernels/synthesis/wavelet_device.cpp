@@ -69,6 +69,7 @@ class DeviceSynthesis final : public WaveletSynthesis {
         context_(device_->context()),
         local_(static_cast<std::size_t>(device_->local_size())),
         chunk_bytes_(device_->description().type == "cpu" ? kCpuChunkBytes : kGpuChunkBytes),
+        strip_(device_->description().type == "cpu" ? 16 : 1),
         queue_(make_queue(context_, device_->id())),
         sigma_rows_(make_kernel(device_->program("wavelet_details"), "ls_sigma_rows")),
         mask_rows_(make_kernel(device_->program("wavelet_details"), "ls_mask_rows")),
@@ -170,8 +171,8 @@ class DeviceSynthesis final : public WaveletSynthesis {
     const LevelShape& level = shape.levels[s];
     const auto rows = static_cast<cl_uint>(level.posts), blocks = std::max<cl_uint>((rows - 1) / 16, 1);
     const auto first = static_cast<cl_uint>(s * LS_HEADER_WORDS), step = static_cast<cl_uint>(shape.levels.size() * LS_HEADER_WORDS);
-    set_args(inverse22_.get(), parameters, first, step, from, detail, to, rows, blocks);
-    launch(queue_.get(), inverse22_.get(), local_, area(rows, blocks), tiles);
+    set_args(inverse22_.get(), parameters, first, step, from, detail, to, rows, blocks, strip_);
+    launch(queue_.get(), inverse22_.get(), local_, area((rows + strip_ - 1) / strip_, blocks), tiles);
   }
 
   // Columns of c and d2, columns of d1 and d3, then rows of both.
@@ -280,7 +281,10 @@ class DeviceSynthesis final : public WaveletSynthesis {
     h[LS_H_MASK_SHIFT] = static_cast<std::uint32_t>(mask.shift);
     h[LS_H_MASK_VERTICES] = mask.is_vertices;
     h[LS_H_MASK_USED_AT] = static_cast<std::uint32_t>(words_.size());
-    words_.insert(words_.end(), mask.row_used.begin(), mask.row_used.end());
+    for (std::size_t row = 0; row < mask.begin.size(); ++row) {
+      words_.push_back(static_cast<std::uint32_t>(mask.begin[row]));
+      words_.push_back(static_cast<std::uint32_t>(mask.end[row]));
+    }
     const auto rows = [&](const std::vector<MaskRow>& list) {
       const std::size_t at = words_.size();
       for (const MaskRow& row : list) {
@@ -291,7 +295,9 @@ class DeviceSynthesis final : public WaveletSynthesis {
           for (int k = 3; k >= 0; --k) value = value << 8 | bytes[static_cast<std::size_t>(n + k)];
           return value;
         };
-        const std::array<std::uint32_t, 4> record{static_cast<std::uint32_t>(row.first), static_cast<std::uint32_t>(row.count), word(0), word(4)};
+        const std::array<std::uint32_t, LS_MASK_RECORD> record{
+            static_cast<std::uint32_t>(row.first), static_cast<std::uint32_t>(row.count), word(0), word(4),
+            static_cast<std::uint32_t>(row.begin), static_cast<std::uint32_t>(row.end)};
         words_.insert(words_.end(), record.begin(), record.end());
       }
       return static_cast<std::uint32_t>(at);
@@ -308,6 +314,7 @@ class DeviceSynthesis final : public WaveletSynthesis {
   const cl_context context_;
   const std::size_t local_;
   const std::size_t chunk_bytes_;
+  const cl_uint strip_;  // coarse rows per work-item of the lifting: long on a CPU, short where many work-items are needed
   const ClQueue queue_;
   const ClKernel sigma_rows_, mask_rows_, details_, inverse22_, inverse44_;
   GrowingBuffer parameters_{true}, sigma_{false}, sums_{false}, detail_{false}, heights_{false}, lines_{false}, out_{true};

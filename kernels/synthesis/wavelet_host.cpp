@@ -18,18 +18,13 @@ std::vector<int> mask_sums(const MaskPlan& mask, const LevelPlan& level, bool is
   const std::vector<int>& columns = is_odd ? level.columns_odd : level.columns_even;
   const int n = ls_mask_count(is_odd, mask.is_vertices), first = ls_mask_first(is_odd, mask.is_vertices);
   for (int r = 0; r < mask.height; ++r) {
-    if (!mask.row_used[static_cast<std::size_t>(r)]) continue;
-    const std::uint16_t* row = mask.source.data() + std::ptrdiff_t{r} * mask.width;
+    const std::uint32_t* row = mask.source.data() + std::ptrdiff_t{r} * mask.width;
     int* out = sums.data() + std::ptrdiff_t{r} * level.stride;
     for (int c = 0; c < level.stride; ++c) {
       const int x = mask.x + 2 * columns[static_cast<std::size_t>(c)] + is_odd + first;
-      int sum = 0, flags = 0;
-      for (int k = 0; k < n; ++k) {
-        const int pixel = row[(x + k) >> mask.shift];
-        sum += ls_mask_weight(k, is_odd, mask.is_vertices) * (pixel & LS_MASK_PIXEL_VALUE);
-        flags |= pixel & LS_MASK_PIXEL_PROTECTS;
-      }
-      out[c] = sum + (flags ? LS_MASK_PROTECTS : 0);
+      int sum = 0;
+      for (int k = 0; k < n; ++k) sum += ls_mask_weight(k, is_odd, mask.is_vertices) * static_cast<int>(row[(x + k) >> mask.shift]);
+      out[c] = ls_mask_folded(sum);
     }
   }
   return sums;

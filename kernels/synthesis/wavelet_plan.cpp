@@ -130,8 +130,8 @@ struct Pixels {
   int level = 0;
   std::int64_t i0 = 0, j0 = 0;
   int width = 0, height = 0;
-  std::vector<std::uint16_t> value;
-  std::uint16_t at(std::int64_t i, std::int64_t j) const {
+  std::vector<std::uint32_t> value;
+  std::uint32_t at(std::int64_t i, std::int64_t j) const {
     return value[static_cast<std::size_t>((j - j0) * width + (i - i0))];
   }
 };
@@ -156,14 +156,14 @@ Pixels merged_masks(const WaveletTask& task) {
       unsigned value = task.mask ? pixel(*task.mask, i >> user_shift, j >> user_shift) : 0u;
       if (value == 255 && protects) value |= LS_MASK_PIXEL_PROTECTS;
       if (task.void_mask && pixel(*task.void_mask, i >> out.level, j >> out.level) == 255) value |= LS_MASK_PIXEL_PROTECTS;
-      out.value.push_back(static_cast<std::uint16_t>(value));
+      out.value.push_back(value);
     }
   return out;
 }
 
 // One value per fine vertex of `window` (fine indices from the world's corner), for masks finer than the fine level by r levels.
-std::vector<std::uint16_t> vertex_values(const Pixels& pixels, const PostWindow& window, int r) {
-  std::vector<std::uint16_t> out;
+std::vector<std::uint32_t> vertex_values(const Pixels& pixels, const PostWindow& window, int r) {
+  std::vector<std::uint32_t> out;
   out.reserve(static_cast<std::size_t>(window.width() * window.height()));
   const std::int64_t half = std::int64_t{1} << (r - 1), whole = std::int64_t{1} << r;
   for (std::int64_t y = window.j0; y <= window.j1; ++y)
@@ -177,21 +177,46 @@ std::vector<std::uint16_t> vertex_values(const Pixels& pixels, const PostWindow&
         for (std::int64_t i = (x << r) - whole; i < (x << r) + whole; ++i)
           flags |= pixels.at(i, j) & LS_MASK_PIXEL_PROTECTS;
       const std::uint64_t v = (4 * sum + (std::uint64_t{1} << (2 * r - 1))) >> (2 * r);
-      out.push_back(static_cast<std::uint16_t>(v | flags));
+      out.push_back(static_cast<std::uint32_t>(v) | flags);
     }
   return out;
 }
 
-MaskRow mask_row(const MaskPlan& plan, int fine_row, bool is_odd) {
+// A span of columns; empty when begin >= end.
+struct Span {
+  int begin = 1 << 20, end = 0;
+  void add(const Span& other) {
+    begin = std::min(begin, other.begin);
+    end = std::max(end, other.end);
+  }
+};
+
+// Columns of coefficients whose filters can meet the non-zero entries of a source row. Mirrored columns lie within eight of the
+// ones that they stand for.
+Span reached_columns(const MaskPlan& plan, int row) {
+  const auto first = plan.source.begin() + std::ptrdiff_t{row} * plan.width, last = first + plan.width;
+  const auto is_set = [](std::uint32_t v) { return v != 0; };
+  const auto low = std::find_if(first, last, is_set);
+  if (low == last) return {};
+  const auto high = std::find_if(std::make_reverse_iterator(last), std::make_reverse_iterator(low), is_set).base();
+  const auto fine = [&](auto it) { return static_cast<int>((it - first) << plan.shift) - plan.x; };
+  return {fine(low) / 2 - 8 - 3, fine(high) / 2 + 8 + 3};
+}
+
+MaskRow mask_row(const MaskPlan& plan, const std::vector<Span>& reached, int fine_row, bool is_odd) {
   MaskRow row;
   const int vertices = plan.is_vertices, odd = is_odd;
   const int start = fine_row + ls_mask_first(odd, vertices), n = ls_mask_count(odd, vertices);
   row.first = start >> plan.shift;
-  row.count = ((start + n - 1) >> plan.shift) - row.first + 1;
-  for (int k = 0; k < n; ++k) row.weight[static_cast<std::size_t>(((start + k) >> plan.shift) - row.first)] += static_cast<std::uint8_t>(ls_mask_weight(k, odd, vertices));
-  bool is_used = false;
-  for (int k = 0; k < row.count; ++k) is_used = is_used || plan.row_used[static_cast<std::size_t>(row.first + k)];
-  if (!is_used) row.count = 0;
+  const int count = ((start + n - 1) >> plan.shift) - row.first + 1;
+  Span span;
+  for (int k = 0; k < count; ++k) span.add(reached[static_cast<std::size_t>(row.first + k)]);
+  if (span.begin >= span.end) return row;
+  row.count = count;
+  row.begin = span.begin;
+  row.end = span.end;
+  for (int k = 0; k < n; ++k)
+    row.weight[static_cast<std::size_t>(((start + k) >> plan.shift) - row.first)] += static_cast<std::uint8_t>(ls_mask_weight(k, odd, vertices));
   return row;
 }
 
@@ -221,15 +246,25 @@ MaskPlan plan_mask(const WaveletTask& task, const Pixels& pixels, const LevelPla
     first_column = fx.first;
     first_row = fy.first;
   }
-  plan.row_used.resize(static_cast<std::size_t>(plan.height));
-  for (int j = 0; j < plan.height; ++j) {
-    const auto row = plan.source.begin() + std::ptrdiff_t{j} * plan.width;
-    plan.row_used[static_cast<std::size_t>(j)] = std::any_of(row, row + plan.width, [](std::uint16_t v) { return v != 0; });
-  }
   plan.x = static_cast<int>(2 * (columns.first - world_x.first) - first_column);
   const auto y = static_cast<int>(2 * (rows.first - world_y.first) - first_row);
-  for (const int r : level.rows_odd) plan.rows_odd.push_back(mask_row(plan, y + 2 * r + 1, true));
-  for (const int r : level.rows_even) plan.rows_even.push_back(mask_row(plan, y + 2 * r, false));
+  std::vector<Span> reached, read(static_cast<std::size_t>(plan.height));
+  for (int row = 0; row < plan.height; ++row) reached.push_back(reached_columns(plan, row));
+  const auto make_rows = [&](const std::vector<int>& relative, bool is_odd, std::vector<MaskRow>& rows_out) {
+    rows_out.reserve(relative.size());
+    for (const int r : relative) {
+      const MaskRow row = mask_row(plan, reached, y + 2 * r + is_odd, is_odd);
+      for (int k = 0; k < row.count; ++k) read[static_cast<std::size_t>(row.first + k)].add({row.begin, row.end});
+      rows_out.push_back(row);
+    }
+  };
+  make_rows(level.rows_odd, true, plan.rows_odd);
+  make_rows(level.rows_even, false, plan.rows_even);
+  for (const Span& span : read) {
+    // Blocks of 16 that touch the span are read whole.
+    plan.begin.push_back(span.begin - 16);
+    plan.end.push_back(span.end + 16);
+  }
   return plan;
 }
 
@@ -326,9 +361,9 @@ WaveletPlan plan_task(const WaveletTask& task) {
   Pixels pixels;
   if ((task.mask || task.void_mask) && task.method != WaveletMethod::kLinear) {
     pixels = merged_masks(task);
-    const auto is_white = [](std::uint16_t v) { return (v & LS_MASK_PIXEL_PROTECTS) || v == 255; };
+    const auto is_white = [](std::uint32_t v) { return (v & LS_MASK_PIXEL_PROTECTS) || v == 255; };
     if (std::all_of(pixels.value.begin(), pixels.value.end(), is_white)) plan.method = WaveletMethod::kLinear;
-    else plan.has_mask = std::any_of(pixels.value.begin(), pixels.value.end(), [](std::uint16_t v) { return v != 0; });
+    else plan.has_mask = std::any_of(pixels.value.begin(), pixels.value.end(), [](std::uint32_t v) { return v != 0; });
   }
   const BasisHalo halo = basis_halo(task.basis);
   std::array<PostWindow, 3> windows;

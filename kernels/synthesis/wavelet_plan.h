@@ -24,14 +24,16 @@ struct SigmaPlan {
 struct MaskRow {
   int first = 0;
   int count = 0;  // 0: no pixel of them matters
+  int begin = 0, end = 0;  // columns of coefficients that the pixels can reach
   std::array<std::uint8_t, 6> weight{};
 };
 
 // Mask source of one level: pixels of a power of two of fine cells each, or one value per fine vertex.
 struct MaskPlan {
   int width = 0, height = 0;
-  std::vector<std::uint16_t> source;  // LS_MASK_PIXEL_: value, protect flag
-  std::vector<std::uint8_t> row_used;
+  std::vector<std::uint32_t> source;  // LS_MASK_PIXEL_: value, protect flag
+  // Per source row: columns of coefficients whose sums somebody reads (begin >= end: none). Sums elsewhere are never looked at.
+  std::vector<int> begin, end;
   int x = 0;      // fine column of relative column index 0, from the source's first fine column
   int shift = 0;  // log2 of fine columns per entry
   bool is_vertices = false;

@@ -16,42 +16,70 @@ LS_FN void ls_store_row(__global float* out, float16 lo, float16 lo_after, float
 
 #define LS_AT(p, n) vload16(0, (p) + (n))
 
-/* One inverse step of CDF(2,2) for posts x posts coarse heights of each tile.
+/* One inverse step of CDF(2,2) for the square of coarse heights of each tile.
      parameters  headers as in ls_wavelet.h, tile n at first_header + n * header_step; details have one coefficient before the posts
      source      coarse heights at LS_H_SOURCE_AT, row stride LS_H_SOURCE_STRIDE;  out: at LS_H_OUT_AT, LS_H_OUT_STRIDE >= 33
-   Writes fine columns 0 .. 32 * blocks of fine rows 0 .. 2 (rows - 1). Work size: x = rows << log2_blocks items, y = tile. */
+   Writes fine columns 0 .. 32 * blocks of fine rows 0 .. 2 (rows - 1). A work-item walks down `strip` coarse rows and keeps the row
+   above in registers. Work size: x = ceil(rows / strip) * blocks items, y = tile. */
 LS_KERNEL void ls_inverse22(__global const uint* parameters, uint first_header, uint header_step, __global const float* source,
-                            __global const float* detail, __global float* out, uint rows, uint blocks) {
+                            __global const float* detail, __global float* out, uint rows, uint blocks, uint strip) {
   __global const uint* h = parameters + first_header + get_global_id(1) * header_step;
-  const uint row = get_global_id(0) / blocks, block = get_global_id(0) - row * blocks, i = block * 16;
+  const uint item = get_global_id(0), row = item / blocks * strip, block = item % blocks, i = block * 16;
   if (row >= rows) return;
   const bool is_last = block + 1 == blocks;
   const int stride = h[LS_H_SOURCE_STRIDE], out_stride = h[LS_H_OUT_STRIDE];
+  const uint below = rows - 1 - row; /* coarse rows after the first one */
+  const uint pairs = min(strip, below);
   __global const float* c = source + h[LS_H_SOURCE_AT] + row * stride + i;
   __global float* fine = out + h[LS_H_OUT_AT] + row * 2 * out_stride + i * 2;
+  float16 lo0 = LS_AT(c, 0), lo1 = LS_AT(c, 1);
   if (h[LS_H_MODE] == LS_MODE_LINEAR) {
-    const float16 zero = (float16)(0.0f), here = LS_AT(c, 0), here_after = LS_AT(c, 1);
-    ls_store_row(fine, here, here_after, zero, zero, zero, is_last);
-    if (row + 1 == rows) return;
-    ls_store_row(fine + out_stride, LS_ODD22(zero, here, LS_AT(c, stride)), LS_ODD22(zero, here_after, LS_AT(c, stride + 1)), zero, zero,
-                 zero, is_last);
+    const float16 zero = (float16)(0.0f);
+    for (uint n = 0; n < pairs; ++n) {
+      c += stride;
+      const float16 next0 = LS_AT(c, 0), next1 = LS_AT(c, 1);
+      ls_store_row(fine, lo0, lo1, zero, zero, zero, is_last);
+      ls_store_row(fine + out_stride, LS_ODD22(zero, lo0, next0), LS_ODD22(zero, lo1, next1), zero, zero, zero, is_last);
+      lo0 = next0;
+      lo1 = next1;
+      fine += 2 * out_stride;
+    }
+    if (below < strip) ls_store_row(fine, lo0, lo1, zero, zero, zero, is_last);
     return;
   }
   const int plane = h[LS_H_PLANE], ds = h[LS_H_STRIDE];
   __global const float* d1 = detail + h[LS_H_DETAIL_AT] + (row + 1) * ds + i + 1;
   __global const float* d2 = d1 + plane;
   __global const float* d3 = d2 + plane;
-  const float16 v0 = LS_AT(d2, 0), v1 = LS_AT(d2, 1), x0 = LS_AT(d3, -1), x1 = LS_AT(d3, 0), x2 = LS_AT(d3, 1);
-  const float16 lo0 = LS_EVEN22(LS_AT(c, 0), LS_AT(d2, -ds), v0), lo1 = LS_EVEN22(LS_AT(c, 1), LS_AT(d2, 1 - ds), v1);
-  const float16 hx0 = LS_EVEN22(LS_AT(d1, -1), LS_AT(d3, -1 - ds), x0), hx1 = LS_EVEN22(LS_AT(d1, 0), LS_AT(d3, -ds), x1),
-                hx2 = LS_EVEN22(LS_AT(d1, 1), LS_AT(d3, 1 - ds), x2);
-  ls_store_row(fine, lo0, lo1, hx0, hx1, hx2, is_last);
-  if (row + 1 == rows) return;
-  const float16 below0 = LS_EVEN22(LS_AT(c, stride), v0, LS_AT(d2, ds)), below1 = LS_EVEN22(LS_AT(c, stride + 1), v1, LS_AT(d2, ds + 1));
-  const float16 hbelow0 = LS_EVEN22(LS_AT(d1, ds - 1), x0, LS_AT(d3, ds - 1)), hbelow1 = LS_EVEN22(LS_AT(d1, ds), x1, LS_AT(d3, ds)),
-                hbelow2 = LS_EVEN22(LS_AT(d1, ds + 1), x2, LS_AT(d3, ds + 1));
-  ls_store_row(fine + out_stride, LS_ODD22(v0, lo0, below0), LS_ODD22(v1, lo1, below1), LS_ODD22(x0, hx0, hbelow0),
-               LS_ODD22(x1, hx1, hbelow1), LS_ODD22(x2, hx2, hbelow2), is_last);
+  float16 v0 = LS_AT(d2, 0), v1 = LS_AT(d2, 1), x0 = LS_AT(d3, -1), x1 = LS_AT(d3, 0), x2 = LS_AT(d3, 1);
+  lo0 = LS_EVEN22(lo0, LS_AT(d2, -ds), v0);
+  lo1 = LS_EVEN22(lo1, LS_AT(d2, 1 - ds), v1);
+  float16 hx0 = LS_EVEN22(LS_AT(d1, -1), LS_AT(d3, -1 - ds), x0), hx1 = LS_EVEN22(LS_AT(d1, 0), LS_AT(d3, -ds), x1),
+          hx2 = LS_EVEN22(LS_AT(d1, 1), LS_AT(d3, 1 - ds), x2);
+  for (uint n = 0; n < pairs; ++n) {
+    c += stride;
+    d1 += ds;
+    d2 += ds;
+    d3 += ds;
+    ls_store_row(fine, lo0, lo1, hx0, hx1, hx2, is_last);
+    const float16 w0 = LS_AT(d2, 0), w1 = LS_AT(d2, 1), y0 = LS_AT(d3, -1), y1 = LS_AT(d3, 0), y2 = LS_AT(d3, 1);
+    const float16 next0 = LS_EVEN22(LS_AT(c, 0), v0, w0), next1 = LS_EVEN22(LS_AT(c, 1), v1, w1);
+    const float16 hnext0 = LS_EVEN22(LS_AT(d1, -1), x0, y0), hnext1 = LS_EVEN22(LS_AT(d1, 0), x1, y1), hnext2 = LS_EVEN22(LS_AT(d1, 1), x2, y2);
+    ls_store_row(fine + out_stride, LS_ODD22(v0, lo0, next0), LS_ODD22(v1, lo1, next1), LS_ODD22(x0, hx0, hnext0),
+                 LS_ODD22(x1, hx1, hnext1), LS_ODD22(x2, hx2, hnext2), is_last);
+    v0 = w0;
+    v1 = w1;
+    x0 = y0;
+    x1 = y1;
+    x2 = y2;
+    lo0 = next0;
+    lo1 = next1;
+    hx0 = hnext0;
+    hx1 = hnext1;
+    hx2 = hnext2;
+    fine += 2 * out_stride;
+  }
+  if (below < strip) ls_store_row(fine, lo0, lo1, hx0, hx1, hx2, is_last);
 }
 
 /* One inverse step of CDF(4,4) along one axis. Line n of tile t: coarse[t * coarse_tile + n * coarse_line + i * coarse_step], details
