@@ -1,5 +1,6 @@
 // What the world does to a disk cache: kills, flipped bits, cut files, full and read-only and vanishing disks.
 #include <fcntl.h>
+#include <poll.h>
 #include <sys/mount.h>
 #include <sys/resource.h>
 #include <sys/stat.h>
@@ -73,6 +74,11 @@ TEST_F(DiskCacheFaults, SurvivesFiftyKills) {
       ::pause();
     }
     ::close(ends[1]);
+    // Every other child is killed some time after its first acknowledgement, the others whatever they are doing, opening included.
+    if (round % 2 == 0) {
+      pollfd first_ack{ends[0], POLLIN, 0};
+      ASSERT_EQ(::poll(&first_ack, 1, 30000), 1) << "round " << round << ": nothing acknowledged in 30 s";
+    }
     std::this_thread::sleep_for(std::chrono::microseconds(500 + random() % 15000));
     ASSERT_EQ(::kill(child, SIGKILL), 0);
     int status = 0;
@@ -94,7 +100,7 @@ TEST_F(DiskCacheFaults, SurvivesFiftyKills) {
     count_right(*cache, first, 400);
     EXPECT_EQ(cache->stats().corrupt, 0u);
   }
-  EXPECT_GT(acknowledged.size(), 500u);
+  EXPECT_GE(acknowledged.size(), 25u * 5);  // however slow the machine
 }
 
 // A file that was flipped while nobody had it open: each flip alone, so that each place counts.
