@@ -100,6 +100,9 @@ Result<CacheEnv::Opened> CacheEnv::open_locked(const Options& options, FileLock 
     } else if (!is_fresh) {
       is_stale = !env.is_current(options);
     }
+    if (is_stale && !options.may_recreate) {
+      return Error{ErrorCode::kCorrupt, data.string() + " is of another format version; verify with repair, or delete the directory"};
+    }
     if (!opened.damage.empty() || is_stale) {
       ::close(std::exchange(env.fd_, -1));
       erase_files(options.directory);

@@ -192,6 +192,20 @@ TEST_F(DiskCacheFaults, VerifyFindsAndRepairsCorruptEntries) {
   EXPECT_EQ(verify_disk_cache(directory(), false)->corrupt, 0u);
 }
 
+TEST_F(DiskCacheFaults, VerifyLeavesAFileOfAnotherVersionAloneUnlessItRepairs) {
+  { fill(*DiskCache::open(options()), 0, 20); }
+  std::string other = data_bytes();
+  const std::string old_version = std::string("format") + std::string("\1\0\0\0", 4);
+  int changed = 0;
+  for (std::size_t at = other.find(old_version); at != std::string::npos; at = other.find(old_version, at + 1), ++changed) other[at + 6] = 2;
+  ASSERT_GT(changed, 0);
+  write_data(other);
+  EXPECT_EQ(verify_disk_cache(directory(), false)->corrupt, 1u);
+  EXPECT_TRUE(data_bytes() == other);
+  EXPECT_TRUE(verify_disk_cache(directory(), true));
+  EXPECT_EQ(count_right(*DiskCache::open(options()), 0, 20), 0u);
+}
+
 TEST_F(DiskCacheFaults, StartsAnewFromGarbageAndCutFiles) {
   { fill(*DiskCache::open(options(2 * kMiB)), 0, 60); }
   const std::string good = data_bytes();
