@@ -57,24 +57,35 @@ std::vector<std::uint8_t> synthetic_provenance(const WaveletTask& task, const st
   return out;
 }
 
-struct PreparedTask {
-  WaveletTask task;
-  std::vector<std::uint8_t> coarse_void;
-};
+}  // namespace
 
-Result<PreparedTask> prepare(const GroundRequest& request) {
-  const Layer& layer = *request.layer;
+void extend_beyond_data(const PostWindow& window, const PostWindow& world, Ground& ground) {
+  if (window.i0 >= world.i0 && window.j0 >= world.j0 && window.i1 <= world.i1 && window.j1 <= world.j1) return;
+  const std::int64_t width = window.width();
+  // Source column and row of each post, counted in the tile; the tile holds at least one post of the data.
+  const auto inside_column = [&](std::int64_t i) { return std::clamp(i, std::max(window.i0, world.i0), std::min(window.i1, world.i1)) - window.i0; };
+  const auto inside_row = [&](std::int64_t j) { return std::clamp(j, std::max(window.j0, world.j0), std::min(window.j1, world.j1)) - window.j0; };
+  for (std::int64_t j = window.j0; j <= window.j1; ++j) {
+    for (std::int64_t i = window.i0; i <= window.i1; ++i) {
+      if (world.contains(i, j)) continue;
+      const auto target = static_cast<std::size_t>((j - window.j0) * width + (i - window.i0));
+      ground.heights_m[target] = ground.heights_m[static_cast<std::size_t>(inside_row(j) * width + inside_column(i))];
+      ground.provenance[target] = kFilled;
+    }
+  }
+}
+
+Result<PreparedTask> prepare_task(const Layer& layer, const Recipe& recipe, std::uint64_t seed, const GroundArea& area) {
   const LayerInfo& info = layer.info();
-  const Recipe& recipe = request.recipe;
   PreparedTask prepared;
   WaveletTask& task = prepared.task;
   task.world = info.world;
   task.base_level = info.base_level;
-  task.depth = request.id.z - info.base_level;
-  task.x0 = request.id.x * info.cells_per_tile();
-  task.y0 = request.id.y * info.cells_per_tile();
-  task.posts = info.posts_per_tile;
-  task.seed = request.seed;
+  task.depth = area.z - info.base_level;
+  task.x0 = area.x0;
+  task.y0 = area.y0;
+  task.posts = area.posts;
+  task.seed = seed;
   task.basis = recipe.basis;
   task.lookup = recipe.lookup;
   task.mask_mode = recipe.mask_mode;
@@ -118,30 +129,6 @@ Result<PreparedTask> prepare(const GroundRequest& request) {
   return prepared;
 }
 
-}  // namespace
-
-void extend_beyond_data(const PostWindow& window, const PostWindow& world, Ground& ground) {
-  if (window.i0 >= world.i0 && window.j0 >= world.j0 && window.i1 <= world.i1 && window.j1 <= world.j1) return;
-  const std::int64_t width = window.width();
-  // Source column and row of each post, counted in the tile; the tile holds at least one post of the data.
-  const auto inside_column = [&](std::int64_t i) { return std::clamp(i, std::max(window.i0, world.i0), std::min(window.i1, world.i1)) - window.i0; };
-  const auto inside_row = [&](std::int64_t j) { return std::clamp(j, std::max(window.j0, world.j0), std::min(window.j1, world.j1)) - window.j0; };
-  for (std::int64_t j = window.j0; j <= window.j1; ++j) {
-    for (std::int64_t i = window.i0; i <= window.i1; ++i) {
-      if (world.contains(i, j)) continue;
-      const auto target = static_cast<std::size_t>((j - window.j0) * width + (i - window.i0));
-      ground.heights_m[target] = ground.heights_m[static_cast<std::size_t>(inside_row(j) * width + inside_column(i))];
-      ground.provenance[target] = kFilled;
-    }
-  }
-}
-
-Result<WaveletTask> wavelet_task(const GroundRequest& request) {
-  auto prepared = prepare(request);
-  if (!prepared) return prepared.error();
-  return std::move(prepared->task);
-}
-
 Result<std::unique_ptr<GroundMaker>> GroundMaker::create(std::shared_ptr<Device> device) {
   if (!device) return std::unique_ptr<GroundMaker>(new GroundMaker(make_host_wavelet_synthesis()));
   auto wavelet = make_device_wavelet_synthesis(std::move(device));
@@ -175,7 +162,10 @@ void GroundMaker::make_wavelet(std::span<const GroundRequest> requests, std::spa
   std::vector<std::vector<std::uint8_t>> coarse_voids;
   std::vector<std::size_t> sources;
   for (const std::size_t n : which) {
-    auto prepared = prepare(requests[n]);
+    const GroundRequest& request = requests[n];
+    const std::int64_t cells = request.layer->info().cells_per_tile();
+    auto prepared = prepare_task(*request.layer, request.recipe, request.seed,
+                                 {request.id.z, request.id.x * cells, request.id.y * cells, static_cast<int>(cells) + 1});
     if (!prepared) {
       grounds[n] = std::move(prepared.error()).within("preparing tile " + to_string(requests[n].id));
       continue;

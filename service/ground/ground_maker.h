@@ -53,8 +53,19 @@ class GroundMaker {
   std::unique_ptr<WaveletSynthesis> wavelet_;
 };
 
-// The task of one synthetic tile (id.z > base level): reads the coarse heights, the maps and the masks that it needs.
-Result<WaveletTask> wavelet_task(const GroundRequest& request);
+// A square of posts of a synthetic level: posts x posts from (x0, y0), global indices; posts - 1 a power of two that divides
+// x0 and y0.
+struct GroundArea {
+  int z = 0;  // > base level
+  std::int64_t x0 = 0, y0 = 0;
+  int posts = 257;
+};
+// A wavelet task with all that it needs of the layer: coarse heights, maps, masks.
+struct PreparedTask {
+  WaveletTask task;
+  std::vector<std::uint8_t> coarse_void;  // of coarse_window(task); empty: no voids
+};
+Result<PreparedTask> prepare_task(const Layer& layer, const Recipe& recipe, std::uint64_t seed, const GroundArea& area);
 
 // Heights and provenance for posts beyond the data: those of the nearest post of the data. `world`: the data's posts at the
 // level of `window`.
