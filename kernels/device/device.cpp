@@ -7,6 +7,8 @@
 #include <cstdlib>
 #include <cstring>
 #include <map>
+#include <mutex>
+#include <set>
 #include <utility>
 
 #include "kernels/device/cl_handles.h"
@@ -159,11 +161,21 @@ class OpenDevice final : public Device {
     return it->second.get();
   }
 
+  void warm_up(std::string_view name, const std::function<void()>& launch_all) override {
+    const std::lock_guard lock(warm_mutex_);
+    if (warm_.contains(name)) return;
+    launch_all();
+    warm_.emplace(name);
+    const auto fresh = fresh_.find(name);
+    if (fresh == fresh_.end() || !save_binary_) return;
+    if (const std::string bytes = binary_of(program(name)); !bytes.empty()) save_binary_(fresh->second, sealed(bytes));
+  }
+
   Result<void> build(const DeviceOptions& options) {
     std::string build_options = "-cl-std=CL1.2 -DLS_LOCAL_SIZE=" + std::to_string(local_size_);
     if (device_value<cl_device_fp_config>(id_, CL_DEVICE_SINGLE_FP_CONFIG) & CL_FP_CORRECTLY_ROUNDED_DIVIDE_SQRT)
       build_options += " -cl-fp32-correctly-rounded-divide-sqrt";
-    std::vector<std::pair<std::string, cl_program>> fresh;
+    save_binary_ = options.save_binary;
     for (const ProgramSource& source : program_sources()) {
       const std::string key = binary_key(source, description_, build_options);
       ClProgram program;
@@ -172,16 +184,13 @@ class OpenDevice final : public Device {
         Result<ClProgram> built = from_source(context_.get(), id_, source, build_options);
         if (!built) return std::move(built.error()).within("opening device " + description_.name);
         program = std::move(*built);
-        fresh.emplace_back(key, program.get());
+        fresh_.emplace(source.name, key);
       }
       programs_.emplace(source.name, std::move(program));
     }
-    if (Result<void> tested = self_test(); !tested) return tested;
-    if (options.save_binary) {
-      for (const auto& [key, program] : fresh)
-        if (const std::string bytes = binary_of(program); !bytes.empty()) options.save_binary(key, sealed(bytes));
-    }
-    return {};
+    Result<void> tested;
+    warm_up("selftest", [&] { tested = self_test(); });
+    return tested;
   }
 
  private:
@@ -226,6 +235,10 @@ class OpenDevice final : public Device {
   const int local_size_;
   ClContext context_;
   std::map<std::string, ClProgram, std::less<>> programs_;
+  std::function<void(const std::string& key, const std::string& bytes)> save_binary_;
+  std::map<std::string, std::string, std::less<>> fresh_;  // programs built from source -> key
+  std::mutex warm_mutex_;                                  // guards the set below, and save_binary_ against concurrent calls
+  std::set<std::string, std::less<>> warm_;
 };
 
 }  // namespace

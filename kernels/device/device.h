@@ -34,7 +34,8 @@ struct DeviceOptions {
   int index = 0;             // among those that match
   int local_size = 64;       // work-items per group for the kernels; results do not depend on it
   // Compiled programs are kept by the caller: `load_binary(key)` gives the bytes or an empty string, `save_binary(key, bytes)`
-  // stores them. The key names device, driver and source hash. Either may be empty. A bad binary falls back to the source.
+  // stores them, once per program after its warm_up() (drivers compile at the first launch). The key names device, driver and
+  // source hash. Either may be empty. A bad binary falls back to the source. Both may be called from any thread, one at a time.
   std::function<std::string(const std::string& key)> load_binary;
   std::function<void(const std::string& key, const std::string& bytes)> save_binary;
 };
@@ -59,6 +60,10 @@ class Device {
   virtual int local_size() const = 0;
   // The built program `name` (stem of a .cl file, e.g. "wavelet"). Asserts that it exists.
   virtual _cl_program* program(std::string_view name) const = 0;
+  // Runs `launch_all` once per device and program name (other callers wait for it). It launches every kernel of that program, so
+  // that nothing is left to compile for the first request; then the program, if it came from source, is given to save_binary.
+  // May throw what launch_all throws; the next caller tries again.
+  virtual void warm_up(std::string_view program, const std::function<void()>& launch_all) = 0;
 };
 
 // FNV-1a of the text of all kernels and shared headers: part of the revision of every synthetic tile.

@@ -17,6 +17,7 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
       : device_(std::move(device)), queue_(make_queue(device_->context(), device_->id())) {
     for (std::size_t n = 0; n < kKernelCount; ++n)
       kernels_[n] = make_kernel(device_->program("fractal"), kernel_name(static_cast<FractalKernel>(n)));
+    device_->warm_up("fractal", [] {});  // keeps the built program
   }
 
   Result<void> run(std::span<const FractalTask> tasks, std::span<std::vector<float>> heights_m) override {

@@ -104,7 +104,7 @@ LS_FN int ls_or16(int16 v) {
 
 /* d * sqrt((full - S) / full), +0 where S reaches full. */
 LS_FN float16 ls_keep(float16 d, int16 removed, int full) {
-  const float16 keep = sqrt(convert_float16(max(full - removed, 0)) / (float)full);
+  const float16 keep = sqrt(convert_float16(max(full - removed, (int16)(0))) / (float)full);
   return select(d * keep, (float16)(0.0f), removed >= full);
 }
 

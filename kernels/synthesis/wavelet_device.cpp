@@ -75,7 +75,10 @@ class DeviceSynthesis final : public WaveletSynthesis {
         mask_rows_(make_kernel(device_->program("wavelet_details"), "ls_mask_rows")),
         details_(make_kernel(device_->program("wavelet_details"), "ls_details")),
         inverse22_(make_kernel(device_->program("lifting"), "ls_inverse22")),
-        inverse44_(make_kernel(device_->program("lifting"), "ls_inverse44")) {}
+        inverse44_(make_kernel(device_->program("lifting"), "ls_inverse44")) {
+    device_->warm_up("wavelet_details", [this] { run_small_tiles(); });
+    device_->warm_up("lifting", [] {});  // the same tiles launch it
+  }
 
   Result<void> run(std::span<const WaveletTask> tasks, std::span<std::vector<float>> heights_m) override {
     assert(tasks.size() == heights_m.size());
@@ -103,6 +106,25 @@ class DeviceSynthesis final : public WaveletSynthesis {
   }
 
  private:
+  // One tile per basis that needs every kernel.
+  void run_small_tiles() {
+    WaveletTask task;
+    task.world = {0, 0, 4, 4};
+    task.posts = 5;
+    task.method = WaveletMethod::kLsa;
+    for (const WaveletBasis basis : {WaveletBasis::kCdf22, WaveletBasis::kCdf44}) {
+      task.basis = basis;
+      const PostWindow coarse = coarse_window(task), pixels = mask_window(task, 0);
+      task.coarse_m.assign(area(static_cast<std::size_t>(coarse.width()), static_cast<std::size_t>(coarse.height())), 0.0f);
+      for (SigmaMap& map : task.maps) map = {0, 0, 2, 2, 2, 2, std::vector<float>(4, 1.0f), std::vector<float>(4, 0.5f)};
+      task.mask = MaskCrop{0, pixels.i0, pixels.j0, static_cast<int>(pixels.width()), static_cast<int>(pixels.height()), {}};
+      task.mask->pixels.assign(area(static_cast<std::size_t>(pixels.width()), static_cast<std::size_t>(pixels.height())), 100);
+      const std::vector<WaveletPlan> plans{plan_task(task)};
+      std::vector<float> heights;
+      run_batch(shape_of(task, plans.front()), {&task, 1}, plans, {&heights, 1});
+    }
+  }
+
   void run_batch(const BatchShape& shape, std::span<const WaveletTask> tasks, const std::vector<WaveletPlan>& plans,
                  std::span<std::vector<float>> heights_m) {
     const std::size_t tiles = tasks.size(), depth = shape.levels.size();
