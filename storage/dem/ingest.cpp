@@ -14,6 +14,7 @@
 
 #include "storage/dem/layer_files.h"
 #include "storage/dem/lmdb_env.h"
+#include "storage/dem/mask_files.h"
 #include "storage/dem/parallel.h"
 #include "storage/dem/raster_source.h"
 #include "storage/dem/tile_codec.h"
@@ -490,6 +491,8 @@ Result<LayerInfo> ingest(const fs::path& data_dir, const IngestOptions& options,
   auto lock = FileLock::acquire(directory / "lock", "layer " + options.layer);
   if (!lock) return lock.error();
   std::string current;
+  std::optional<LayerInfo> previous;
+  if (auto old = LayerStore::open(data_dir, options.layer)) previous = (*old)->info();
   if (auto generation = current_generation(data_dir, options.layer))
     current = generation->filename().string();
   char name[32];
@@ -517,6 +520,10 @@ Result<LayerInfo> ingest(const fs::path& data_dir, const IngestOptions& options,
     return std::move(info.error()).within("ingesting layer " + options.layer);
   }
   sweep(directory, name);  // the old generation; whoever has it open keeps its map
+  if (auto ok = rewarp_masks(data_dir, *info, previous ? &*previous : nullptr); !ok) {
+    return std::move(ok.error())
+        .within("warping the masks of layer " + options.layer + ", which is ingested");
+  }
   if (progress) progress({"publish", 1});
   return info;
 }

@@ -4,6 +4,7 @@
 #include <optional>
 
 #include "storage/dem/layer_files.h"
+#include "storage/dem/mask_files.h"
 #include "storage/dem/tile_codec.h"
 #include "storage/dem/tile_reader.h"
 
@@ -68,6 +69,7 @@ Result<VerifyReport> verify_layer(const std::filesystem::path& data_dir, const s
     else if (!*found)
       problem(key, "missing");
   }
+  verify_masks(data_dir, *info, report);
   if (progress) progress(1);
   return report;
 }

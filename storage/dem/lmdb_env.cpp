@@ -154,22 +154,22 @@ Result<bool> LmdbEnv::read(std::string_view key, const std::function<void(ByteVi
   return true;
 }
 
-Result<void> LmdbEnv::for_each(const std::function<bool(std::string_view, ByteView)>& use) const {
+Result<void> LmdbEnv::for_each(std::string_view prefix,
+                               const std::function<bool(std::string_view, ByteView)>& use) const {
   MDB_txn* raw = nullptr;
   if (int code = mdb_txn_begin(env_, nullptr, MDB_RDONLY, &raw)) return failure(code, "reading");
   const Txn txn(raw);
   MDB_cursor* cursor = nullptr;
   if (int code = mdb_cursor_open(txn.get(), dbi_, &cursor)) return failure(code, "reading");
   const std::unique_ptr<MDB_cursor, decltype(&mdb_cursor_close)> closer(cursor, &mdb_cursor_close);
-  MDB_val key{};
+  MDB_val key = val(prefix.data(), prefix.size());
   MDB_val value{};
-  int code = 0;
-  while ((code = mdb_cursor_get(cursor, &key, &value, MDB_NEXT)) == 0) {
+  int code = mdb_cursor_get(cursor, &key, &value, prefix.empty() ? MDB_FIRST : MDB_SET_RANGE);
+  for (; code == 0; code = mdb_cursor_get(cursor, &key, &value, MDB_NEXT)) {
     if (!is_inside(value) || !is_inside(key)) return failure(MDB_CORRUPTED, "reading");
-    if (!use({static_cast<const char*>(key.mv_data), key.mv_size},
-             {static_cast<const std::uint8_t*>(value.mv_data), value.mv_size})) {
-      return {};
-    }
+    const std::string_view name(static_cast<const char*>(key.mv_data), key.mv_size);
+    if (name.substr(0, prefix.size()) != prefix) return {};
+    if (!use(name, {static_cast<const std::uint8_t*>(value.mv_data), value.mv_size})) return {};
     forget_pages(value.mv_size);
   }
   if (code != MDB_NOTFOUND) return failure(code, "reading");

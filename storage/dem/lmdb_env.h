@@ -51,8 +51,9 @@ class LmdbEnv {
   Result<void> sync();
   // Calls use(value) with bytes that live in the map until it returns. False if there is no such key.
   Result<bool> read(std::string_view key, const std::function<void(ByteView)>& use) const;
-  // Every item in key order until `use` returns false.
-  Result<void> for_each(const std::function<bool(std::string_view key, ByteView value)>& use) const;
+  // Every item whose key begins with `prefix`, in key order, until `use` returns false.
+  Result<void> for_each(std::string_view prefix,
+                        const std::function<bool(std::string_view key, ByteView value)>& use) const;
   const std::filesystem::path& file() const { return file_; }
 
  private:

@@ -23,10 +23,13 @@ class MaskStore {
 
   virtual std::vector<MaskInfo> list() const = 0;  // sorted by name
   // Decodes PNG, EXR or GeoTIFF bytes (georeferenced: warped to the layer's CRS; without georeference: stretched over the
-  // layer's bounds) and stores them: acknowledged = durable. `level` chosen so that aligned pixels are kept exactly
-  // (0..3), else area average at the nearest level. Outside the raster and at its nodata: 0.
-  // Errors: kTooLarge (declared size over 2^28 pixels or 2^28 bytes, before decoding), kUnsupported (other format),
-  // kCorrupt (does not decode), kConflict, kIo.
+  // layer's cells) and stores them: acknowledged = durable. `level` chosen so that aligned pixels are kept exactly
+  // (0..3), else area average at the nearest level of those (coarser where that would be over 2^28 pixels). Outside the
+  // raster and at its nodata: 0. Grey 0..1 is the integer type's range, or 0..1 itself for floats (clamped); an integer raster
+  // without values over 1 is a 0/1 mask. Colours: the mean of the channels; alpha is ignored.
+  // Errors: kTooLarge (declared size over 2^26 pixels, a side over 65536, or 2^28 bytes, before decoding), kUnsupported (other
+  // format, colour table, deep EXR), kCorrupt (does not decode), kInvalidArgument (name; layer without cells; raster beside
+  // the layer), kConflict, kIo.
   virtual Result<MaskInfo> put(const std::string& name, std::span<const std::uint8_t> bytes) = 0;
   // The mask as an 8-bit GeoTIFF or PNG on its own pixel grid. Error: kNotFound.
   virtual Result<std::string> get(const std::string& name, const std::string& extension) const = 0;
