@@ -1,11 +1,13 @@
 #include "service/http/connection.h"
 
+#include <sys/epoll.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cerrno>
 #include <cstring>
+#include <utility>
 
 #include "service/http/problem.h"
 
@@ -22,9 +24,12 @@ constexpr auto kNever = ServerCore::Clock::time_point::max();
 
 }  // namespace
 
-Connection::Connection(std::shared_ptr<ServerCore> core, ServerCore::Socket socket, std::string remote_address)
-    : core_(std::move(core)), socket_(std::move(socket)), fd_(socket_.native_handle()),
-      remote_address_(std::move(remote_address)) {}
+Connection::Connection(std::shared_ptr<ServerCore> core, int fd, std::string remote_address)
+    : core_(std::move(core)), fd_(fd), remote_address_(std::move(remote_address)) {}
+
+Connection::~Connection() {
+  if (fd_ >= 0) ::close(fd_);
+}
 
 void Connection::start() {
   request_start_ = Clock::now();
@@ -257,7 +262,7 @@ bool Connection::advance_write() {
       sent_bytes_ += static_cast<std::size_t>(sent);
     } else if (errno == EAGAIN || errno == EWOULDBLOCK) {
       deadline_ = Clock::now() + core_->options.write_timeout;
-      arm_write();
+      wants_write_ = true;
       return false;
     } else if (errno != EINTR) {
       drop();
@@ -324,10 +329,10 @@ void Connection::close() {
   if (state_ == State::kClosed) return;
   state_ = State::kClosed;
   const auto self = shared_from_this();
-  boost::system::error_code ignored;
-  socket_.close(ignored);
+  wants_read_ = wants_write_ = false;
+  ::close(std::exchange(fd_, -1));
   response_ = Response();
-  if (const auto pending = std::move(pending_)) pending->abandon();
+  if (const auto pending = std::exchange(pending_, nullptr)) pending->abandon();
   core_->remove(self);
 }
 
@@ -361,33 +366,33 @@ void Connection::begin_drain(Clock::time_point now) {
   if (state_ == State::kIdle) deadline_ = std::min(deadline_, now + core_->options.drain_idle_time);
 }
 
+void Connection::on_event(std::uint32_t events) {
+  if (state_ == State::kClosed) return;
+  const auto self = shared_from_this();
+  if (events & (EPOLLIN | EPOLLRDHUP | EPOLLHUP | EPOLLERR)) can_read_ = true;
+  if (events & (EPOLLRDHUP | EPOLLHUP | EPOLLERR)) has_end_edge_ = true;
+  if ((events & (EPOLLHUP | EPOLLERR)) && state_ == State::kHandling) drop_if_reset();
+  if ((events & (EPOLLOUT | EPOLLHUP | EPOLLERR)) && wants_write_) {
+    wants_write_ = false;
+    process();
+  }
+  if (can_read_ && wants_read_) on_readable();
+}
+
+// Reading goes on in on_readable(), at the next edge or, if there is something left, in the next turn.
 void Connection::arm_read() {
-  if (is_read_armed_) return;
-  is_read_armed_ = true;
-  socket_.async_wait(ServerCore::Socket::wait_read, [self = shared_from_this()](const boost::system::error_code& ec) {
-    self->is_read_armed_ = false;
-    if (!ec && self->state_ != State::kClosed) self->on_readable();
+  wants_read_ = true;
+  if (!can_read_) return;
+  core_->post([self = shared_from_this()] {
+    if (self->wants_read_ && self->can_read_) self->on_readable();
   });
 }
 
-void Connection::arm_write() {
-  socket_.async_wait(ServerCore::Socket::wait_write, [self = shared_from_this()](const boost::system::error_code& ec) {
-    if (!ec && self->state_ == State::kWriting) self->process();
-  });
-}
-
-// Completes when the connection is reset.
-void Connection::arm_error() {
-  if (is_error_armed_) return;
-  is_error_armed_ = true;
-  socket_.async_wait(ServerCore::Socket::wait_error, [self = shared_from_this()](const boost::system::error_code& ec) {
-    self->is_error_armed_ = false;
-    if (ec || self->state_ != State::kHandling) return;
-    int error = 0;
-    socklen_t size = sizeof error;
-    ::getsockopt(self->fd_, SOL_SOCKET, SO_ERROR, &error, &size);
-    if (error != 0) self->drop();
-  });
+void Connection::drop_if_reset() {
+  int error = 0;
+  socklen_t size = sizeof error;
+  ::getsockopt(fd_, SOL_SOCKET, SO_ERROR, &error, &size);
+  if (error != 0) drop();
 }
 
 Connection::Io Connection::receive() {
@@ -401,7 +406,9 @@ Connection::Io Connection::receive() {
   const std::size_t limit = std::max(kBodyBufferBytes, o.max_request_line_bytes + o.max_header_bytes + 1024);
   if (in_end_ == in_.size() && in_.size() < limit) in_.resize(std::min(limit, in_.size() * 4));
   if (in_end_ == in_.size()) return state_ == State::kHandling || state_ == State::kWriting ? Io::kBlocked : Io::kFailed;
-  const ssize_t got = ::recv(fd_, in_.data() + in_end_, in_.size() - in_end_, MSG_DONTWAIT);
+  const std::size_t room = in_.size() - in_end_;
+  const ssize_t got = ::recv(fd_, in_.data() + in_end_, room, MSG_DONTWAIT);
+  can_read_ = got > 0 && (static_cast<std::size_t>(got) == room || has_end_edge_);
   if (got > 0) {
     in_end_ += static_cast<std::size_t>(got);
     return Io::kDone;
@@ -414,6 +421,7 @@ Connection::Io Connection::receive() {
 }
 
 void Connection::on_readable() {
+  wants_read_ = false;
   const Io io = receive();
   if (io == Io::kFailed) {
     drop();
@@ -444,10 +452,7 @@ void Connection::on_readable() {
 void Connection::watch_client() {
   if (is_peer_done_) {
     if (deadline_ == kNever && !is_probed_) deadline_ = Clock::now() + core_->options.half_close_probe_after;
-    arm_error();
-  } else if (in_end_ - in_begin_ >= kBodyBufferBytes) {
-    arm_error();
-  } else {
+  } else if (in_end_ - in_begin_ < kBodyBufferBytes) {
     arm_read();
   }
 }

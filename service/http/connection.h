@@ -18,7 +18,13 @@ namespace lodestone::http {
 class Connection : public AnswerSink, public std::enable_shared_from_this<Connection> {
  public:
   using Clock = ServerCore::Clock;
-  Connection(std::shared_ptr<ServerCore> core, ServerCore::Socket socket, std::string remote_address);
+  // Takes the socket `fd`, which must be non-blocking.
+  Connection(std::shared_ptr<ServerCore> core, int fd, std::string remote_address);
+  ~Connection() override;
+
+  int fd() const { return fd_; }
+  // Edges of the socket, as epoll tells them.
+  void on_event(std::uint32_t events);
 
   void start();
   // Answers 503 and closes: there are too many connections.
@@ -53,8 +59,7 @@ class Connection : public AnswerSink, public std::enable_shared_from_this<Connec
   void record(int status, bool is_aborted);
 
   void arm_read();
-  void arm_write();
-  void arm_error();
+  void drop_if_reset();
   void on_readable();
   Io receive();
   void watch_client();
@@ -66,8 +71,7 @@ class Connection : public AnswerSink, public std::enable_shared_from_this<Connec
   }
 
   const std::shared_ptr<ServerCore> core_;
-  ServerCore::Socket socket_;
-  const int fd_;
+  int fd_;  // -1 once closed
   const std::string remote_address_;
   State state_ = State::kIdle;
   Clock::time_point deadline_;
@@ -75,7 +79,9 @@ class Connection : public AnswerSink, public std::enable_shared_from_this<Connec
   // Input.
   std::vector<char> in_;
   std::size_t in_begin_ = 0, in_end_ = 0;
-  bool is_read_armed_ = false, is_error_armed_ = false;
+  bool can_read_ = false;     // an edge has come and not all is read
+  bool wants_read_ = false, wants_write_ = false;
+  bool has_end_edge_ = false;  // the end of input is among the edges, so a short read has not drained it
   bool is_peer_done_ = false;  // the client has closed its sending side
   std::size_t lingered_bytes_ = 0;
 

@@ -5,6 +5,7 @@
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <arpa/inet.h>
+#include <sys/epoll.h>
 #include <sys/resource.h>
 #include <sys/socket.h>
 #include <unistd.h>
@@ -14,6 +15,7 @@
 #include <cerrno>
 #include <cstring>
 #include <random>
+#include <utility>
 
 #include "service/http/connection.h"
 #include "service/http/server_core.h"
@@ -22,6 +24,8 @@ namespace lodestone::http {
 namespace {
 
 constexpr int kAcceptsPerTurn = 64;
+constexpr int kEventsPerTurn = 256;
+constexpr int kMaxUnsentBytes = 128 * 1024;
 constexpr std::size_t kSpareFds = 256;  // for files, devices and the admin listener
 constexpr std::chrono::milliseconds kMaxSweep{250}, kMinSweep{10};
 
@@ -86,7 +90,7 @@ std::uint64_t random_word() {
 }  // namespace
 
 ServerCore::ServerCore(Router router_in, ServerOptions options_in)
-    : router(std::move(router_in)), options(std::move(options_in)), cors(options.cors_origins), head_writer_(cors), sweep_timer_(io_),
+    : router(std::move(router_in)), options(std::move(options_in)), cors(options.cors_origins), head_writer_(cors), sweep_timer_(io_), events_(io_, ::epoll_create1(EPOLL_CLOEXEC)),
       id_high_(random_word()), id_low_(random_word()) {
   const std::size_t fds = raised_fd_limit();
   max_connections_ = std::min(options.max_connections, fds > 2 * kSpareFds ? fds - kSpareFds : fds / 2);
@@ -94,6 +98,8 @@ ServerCore::ServerCore(Router router_in, ServerOptions options_in)
                                   options.linger_timeout, options.drain_idle_time, options.half_close_probe_after});
   sweep_interval_ = std::clamp(std::chrono::milliseconds(shortest / 4), kMinSweep, kMaxSweep);
 }
+
+ServerCore::~ServerCore() = default;
 
 Result<std::uint16_t> ServerCore::add_listener(int fd) {
   auto port = port_of(fd);
@@ -120,6 +126,7 @@ void ServerCore::run() {
   io_thread_ = std::this_thread::get_id();
   for (std::size_t i = 0; i < acceptors_.size(); ++i) arm_accept(i);
   arm_sweep();
+  arm_events();
   io_.run();  // ends when the drain has closed everything
   {
     const std::lock_guard lock(post_mutex_);
@@ -163,19 +170,23 @@ bool ServerCore::accept_some(std::size_t index) {
 void ServerCore::accept_one(int fd, const std::string& remote_address) {
   const int on = 1;
   ::setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
-  boost::system::error_code ec;
-  Socket socket(io_);
-  socket.assign(remote_address.find(':') == std::string::npos ? boost::asio::ip::tcp::v4() : boost::asio::ip::tcp::v6(), fd, ec);
-  if (ec) {
-    ::close(fd);
-    return;
-  }
-  socket.non_blocking(true, ec);
+  // A client that does not read must not make the kernel hold megabytes for it.
+  ::setsockopt(fd, IPPROTO_TCP, TCP_NOTSENT_LOWAT, &kMaxUnsentBytes, sizeof kMaxUnsentBytes);
   const bool is_refused = connections_.size() >= max_connections_;
   if (is_refused) ++refused_;
   // Past the limit a refused client may stay for the lingering close; with so many of those as well, none.
-  if (is_refused && connections_.size() >= max_connections_ + kSpareFds / 2) return;
-  auto connection = std::make_shared<Connection>(shared_from_this(), std::move(socket), remote_address);
+  if (is_refused && connections_.size() >= max_connections_ + kSpareFds / 2) {
+    ::close(fd);
+    return;
+  }
+  auto connection = std::make_shared<Connection>(shared_from_this(), fd, remote_address);
+  epoll_event edges{};
+  edges.events = EPOLLIN | EPOLLOUT | EPOLLRDHUP | EPOLLET;
+  edges.data.ptr = connection.get();
+  if (::epoll_ctl(events_.native_handle(), EPOLL_CTL_ADD, fd, &edges) != 0) {
+    ++refused_;
+    return;
+  }
   connections_.insert(connection);
   open_ = connections_.size();
   if (is_refused) {
@@ -186,7 +197,25 @@ void ServerCore::accept_one(int fd, const std::string& remote_address) {
   }
 }
 
+void ServerCore::arm_events() {
+  events_.async_wait(boost::asio::posix::stream_descriptor::wait_read, [self = shared_from_this()](const boost::system::error_code& ec) {
+    if (ec) return;
+    self->take_events();
+    if (!self->is_draining_ || !self->connections_.empty()) self->arm_events();
+  });
+}
+
+void ServerCore::take_events() {
+  epoll_event edges[kEventsPerTurn];
+  const int count = ::epoll_wait(events_.native_handle(), edges, kEventsPerTurn, 0);
+  is_taking_events_ = true;
+  for (int i = 0; i < count; ++i) static_cast<Connection*>(edges[i].data.ptr)->on_event(edges[i].events);
+  is_taking_events_ = false;
+  closed_meanwhile_.clear();
+}
+
 void ServerCore::remove(const std::shared_ptr<Connection>& connection) {
+  if (is_taking_events_) closed_meanwhile_.push_back(connection);
   connections_.erase(connection);
   open_ = connections_.size();
   if (is_draining_) end_if_drained();
@@ -247,7 +276,9 @@ void ServerCore::drop_all() {
 
 // Without acceptors, connections and timer the io context runs out of work.
 void ServerCore::end_if_drained() {
-  if (connections_.empty()) sweep_timer_.cancel();
+  if (!connections_.empty()) return;
+  sweep_timer_.cancel();
+  events_.cancel();
 }
 
 bool ServerCore::wait() {

@@ -4,6 +4,7 @@
 #include <atomic>
 #include <boost/asio/io_context.hpp>
 #include <boost/asio/ip/tcp.hpp>
+#include <boost/asio/posix/stream_descriptor.hpp>
 #include <boost/asio/post.hpp>
 #include <boost/asio/steady_timer.hpp>
 #include <chrono>
@@ -11,6 +12,7 @@
 #include <mutex>
 #include <thread>
 #include <unordered_set>
+#include <vector>
 
 #include "service/http/response_head.h"
 #include "service/http/server.h"
@@ -22,10 +24,10 @@ class Connection;
 class ServerCore : public std::enable_shared_from_this<ServerCore> {
  public:
   using Clock = std::chrono::steady_clock;
-  using Socket = boost::asio::ip::tcp::socket;
   using Acceptor = boost::asio::ip::tcp::acceptor;
 
   ServerCore(Router router, ServerOptions options);
+  ~ServerCore();
 
   // Any thread.
   Result<std::uint16_t> add_listener(int fd);  // before start()
@@ -59,6 +61,8 @@ class ServerCore : public std::enable_shared_from_this<ServerCore> {
   void arm_accept(std::size_t index);
   bool accept_some(std::size_t index);
   void accept_one(int fd, const std::string& remote_address);
+  void arm_events();
+  void take_events();
   void arm_sweep();
   void sweep();
   void begin_drain(std::chrono::milliseconds deadline);
@@ -70,6 +74,11 @@ class ServerCore : public std::enable_shared_from_this<ServerCore> {
   std::vector<std::unique_ptr<Acceptor>> acceptors_;
   std::vector<std::size_t> paused_;  // acceptors that wait for the next sweep, because there were no fds
   boost::asio::steady_timer sweep_timer_;
+  // The clients' sockets have an epoll set of their own, edge-triggered and set up once a connection; Asio watches the set. Asio's
+  // own waits would cost a system call for each request.
+  boost::asio::posix::stream_descriptor events_;
+  bool is_taking_events_ = false;
+  std::vector<std::shared_ptr<Connection>> closed_meanwhile_;  // may still be named by the events in hand
   std::unordered_set<std::shared_ptr<Connection>> connections_;
   std::size_t max_connections_ = 0;
   Clock::duration sweep_interval_{};

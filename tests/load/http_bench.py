@@ -6,6 +6,7 @@ Needs nginx and wrk. Prints medians and ratios; exit 1 when a 64 or 264 KiB rati
 """
 import argparse
 import json
+import os
 import pathlib
 import re
 import shutil
@@ -46,11 +47,23 @@ def etag_of(port, path):
     return re.search(r"(?i)^etag: (.*?)\r$", answer, re.M).group(1)
 
 
-def wrk(port, path, seconds, etag):
+def cpu_seconds(pid):
+    """User and system time of a process and its children: what a request costs, however busy the machine is."""
+    pids = [pid] + [int(p) for p in pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    ticks = 0
+    for one in pids:
+        fields = pathlib.Path(f"/proc/{one}/stat").read_text().rsplit(")", 1)[1].split()
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def wrk(port, path, seconds, etag, pid):
     command = ["wrk", "-t1", "-c64", f"-d{seconds}s", "--latency", f"http://127.0.0.1:{port}{path}"]
     if etag:
         command[1:1] = ["-H", f"If-None-Match: {etag}"]
+    before = cpu_seconds(pid)
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    cpu = cpu_seconds(pid) - before
     if etag is None and "Non-2xx" in text or "Socket errors" in text:
         raise RuntimeError(text)
     scale = {"us": 1e-3, "ms": 1.0, "s": 1e3}
@@ -58,7 +71,8 @@ def wrk(port, path, seconds, etag):
     def percentile(p):
         value, unit = re.search(rf"\s{p}%\s+([\d.]+)(us|ms|s)", text).groups()
         return float(value) * scale[unit]
-    return {"rps": float(re.search(r"Requests/sec:\s+([\d.]+)", text).group(1)), "p50_ms": percentile(50), "p99_ms": percentile(99)}
+    return {"rps": float(re.search(r"Requests/sec:\s+([\d.]+)", text).group(1)), "p50_ms": percentile(50), "p99_ms": percentile(99),
+            "cpu_us": cpu * 1e6 / int(re.search(r"(\d+) requests in", text).group(1))}
 
 
 def main():
@@ -88,17 +102,18 @@ def main():
         try:
             ports["ours"] = int(ours.stdout.readline())
             time.sleep(0.5)
+            pids = {"nginx": nginx.pid, "ours": ours.pid}
             report = {}
             for label, path, wants_etag in [c for c in CASES if args.only in (None, c[0])]:
                 etags = {who: etag_of(port, path) if wants_etag else None for who, port in ports.items()}
                 rows = {"ours": [], "nginx": []}
                 for who in ("ours", "nginx"):  # one short round each to warm up
-                    wrk(ports[who], path, 1, etags[who])
+                    wrk(ports[who], path, 1, etags[who], pids[who])
                 for turn in range(args.rounds):
                     for who in (("ours", "nginx"), ("nginx", "ours"))[turn % 2]:
-                        rows[who].append(wrk(ports[who], path, args.seconds, etags[who]))
+                        rows[who].append(wrk(ports[who], path, args.seconds, etags[who], pids[who]))
                 row = {}
-                for key in ("rps", "p50_ms", "p99_ms"):
+                for key in ("rps", "p50_ms", "p99_ms", "cpu_us"):
                     ratios = [a[key] / b[key] for a, b in zip(rows["ours"], rows["nginx"])]
                     row[key] = {"ours": statistics.median(r[key] for r in rows["ours"]),
                                 "nginx": statistics.median(r[key] for r in rows["nginx"]), "ratio": statistics.median(ratios)}

@@ -328,6 +328,7 @@ TEST_F(ServerTest, ClosesReadersThatStopReading) {
   ASSERT_TRUE(wait_for([&] { return !log_.empty(); }));
   EXPECT_TRUE(log_[0].is_aborted);
   EXPECT_LT(log_[0].bytes, kBigBytes);
+  EXPECT_TRUE(stuck.is_closed_within(5000));
   EXPECT_EQ(server_->counters().connections_open, 0u);
 }
 
