@@ -12,7 +12,8 @@ double quality(const LatticePoint& a, const LatticePoint& b, const LatticePoint&
     const std::int64_t dx = q.col - p.col, dy = q.row - p.row;
     return dx * dx + dy * dy;
   };
-  return static_cast<double>(orient(a, b, c)) / static_cast<double>(std::max({length2(a, b), length2(b, c), length2(c, a)}));
+  return static_cast<double>(orient(a, b, c)) /
+         static_cast<double>(std::max({length2(a, b), length2(b, c), length2(c, a)}));
 }
 
 // Diagonals whose shapes are this similar are told apart by their errors.
@@ -38,9 +39,9 @@ double segment_distance2(const LatticePoint& p, const LatticePoint& a, const Lat
 
 }  // namespace
 
-Refinement::Refinement(Triangulation& mesh, std::span<const float> heights_m, std::span<float> work_m, std::int32_t cols,
-                       std::span<const BorderSegment> segments, std::vector<std::uint16_t>& zone, TinCriterion criterion,
-                       double tie_cells)
+Refinement::Refinement(Triangulation& mesh, std::span<const float> heights_m, std::span<float> work_m,
+                       std::int32_t cols, std::span<const BorderSegment> segments,
+                       std::vector<std::uint16_t>& zone, TinCriterion criterion, double tie_cells)
     : mesh_(mesh),
       heights_m_(heights_m),
       work_m_(work_m),
@@ -53,7 +54,9 @@ Refinement::Refinement(Triangulation& mesh, std::span<const float> heights_m, st
 
 ScanPoint Refinement::scan_point(std::int32_t v) const {
   const LatticePoint& p = mesh_.point(v);
-  return {p.col, p.row, heights_m_[static_cast<std::size_t>(p.row) * static_cast<std::size_t>(cols_) + static_cast<std::size_t>(p.col)]};
+  return {p.col, p.row,
+          heights_m_[static_cast<std::size_t>(p.row) * static_cast<std::size_t>(cols_) +
+                     static_cast<std::size_t>(p.col)]};
 }
 
 ScanResult Refinement::scan(std::int32_t a, std::int32_t b, std::int32_t c) const {
@@ -61,7 +64,8 @@ ScanResult Refinement::scan(std::int32_t a, std::int32_t b, std::int32_t c) cons
 }
 
 void Refinement::store(std::int32_t t, const ScanResult& result) {
-  sites_[static_cast<std::size_t>(t)] = {result.error_m, result.sum2_m2, result.col < 0 ? -1 : result.row * cols_ + result.col, true};
+  sites_[static_cast<std::size_t>(t)] = {result.error_m, result.sum2_m2,
+                                         result.col < 0 ? -1 : result.row * cols_ + result.col, true};
 }
 
 const Refinement::Site& Refinement::site(std::int32_t t) {
@@ -79,8 +83,8 @@ void Refinement::mark_stale(std::size_t first_touched) {
   }
 }
 
-// The constrained edge of t that p, strictly inside t, is tied to, or kNone. The paper's corrected snap: the edge comes to the
-// post; measured against the original segment, so that a border cannot drift.
+// The constrained edge of t that p, strictly inside t, is tied to, or kNone. The paper's corrected snap: the
+// edge comes to the post; measured against the original segment, so that a border cannot drift.
 std::int32_t Refinement::tied_edge(std::int32_t t, const LatticePoint& p) const {
   std::int32_t best = Triangulation::kNone;
   double best_d2 = tie_cells_ * tie_cells_;
@@ -93,7 +97,8 @@ std::int32_t Refinement::tied_edge(std::int32_t t, const LatticePoint& p) const 
     const LatticePoint& r = mesh_.point(mesh_.apex(mesh_.twin(e)));
     const Foot f = foot_on(p, a, b);
     if (f.along <= 0 || f.along >= f.length2) continue;
-    const double d2 = static_cast<double>(f.cross) * static_cast<double>(f.cross) / static_cast<double>(f.length2);
+    const double d2 =
+        static_cast<double>(f.cross) * static_cast<double>(f.cross) / static_cast<double>(f.length2);
     if (d2 >= best_d2 || segment_distance2(p, segment.a, segment.b) >= tie_cells_ * tie_cells_) continue;
     if (orient(p, a, r) <= 0 || orient(b, p, r) <= 0) continue;
     best = e;
@@ -108,8 +113,8 @@ void Refinement::insert(std::int32_t t, const LatticePoint& p) {
     if (orient(mesh_.point(mesh_.origin(e)), mesh_.point(mesh_.destination(e)), p) == 0) edge = e;
   }
   if (edge == Triangulation::kNone && tie_cells_ > 0 && !segments_.empty()) edge = tied_edge(t, p);
-  work_m_[static_cast<std::size_t>(p.row) * static_cast<std::size_t>(cols_) + static_cast<std::size_t>(p.col)] =
-      std::numeric_limits<float>::quiet_NaN();
+  work_m_[static_cast<std::size_t>(p.row) * static_cast<std::size_t>(cols_) +
+          static_cast<std::size_t>(p.col)] = std::numeric_limits<float>::quiet_NaN();
   std::int32_t v = 0;
   if (edge == Triangulation::kNone) {
     v = mesh_.insert_inside(t, p);
@@ -147,7 +152,8 @@ void Refinement::legalize(std::int32_t vertex) {
 }
 
 bool Refinement::try_swap(std::int32_t e) {
-  const std::int32_t a = mesh_.apex(e), b = mesh_.origin(e), d = mesh_.destination(e), c = mesh_.apex(mesh_.twin(e));
+  const std::int32_t a = mesh_.apex(e), b = mesh_.origin(e), d = mesh_.destination(e),
+                     c = mesh_.apex(mesh_.twin(e));
   const std::int32_t t = e / 3, u = mesh_.twin(e) / 3;
   const LatticePoint &pa = mesh_.point(a), &pb = mesh_.point(b), &pc = mesh_.point(c), &pd = mesh_.point(d);
   if (criterion_ == TinCriterion::kDelaunay) {
@@ -192,7 +198,8 @@ Refinement::Outcome Refinement::run(double bound_m, std::size_t max_triangles, s
   Outcome outcome;
   const auto top_error = [&] { return heap_.empty() ? 0.0 : heap_[0].error_m; };
   outcome.error_m = outcome.best_error_m = top_error();
-  while (!heap_.empty() && mesh_.triangle_count() + 2 <= max_triangles && outcome.insertions < max_insertions) {
+  while (!heap_.empty() && mesh_.triangle_count() + 2 <= max_triangles &&
+         outcome.insertions < max_insertions) {
     const Entry worst = heap_[0];
     insert(worst.triangle, {worst.post % cols_, worst.post / cols_});
     for (const std::int32_t u : mesh_.touched()) {

@@ -21,18 +21,21 @@ struct BorderSegment {
 
 class Refinement {
  public:
-  // heights_m: cols * rows. work_m: the same with NaN where no vertex may go (tile edges, vertices, voids), followed by
-  // kScanPadding floats. segments: by constraint number. zone: one per triangle, or empty. All spans outlive the object.
-  Refinement(Triangulation& mesh, std::span<const float> heights_m, std::span<float> work_m, std::int32_t cols,
-             std::span<const BorderSegment> segments, std::vector<std::uint16_t>& zone, TinCriterion criterion, double tie_cells);
+  // heights_m: cols * rows. work_m: the same with NaN where no vertex may go (tile edges, vertices, voids),
+  // followed by kScanPadding floats. segments: by constraint number. zone: one per triangle, or empty. All
+  // spans outlive the object.
+  Refinement(Triangulation& mesh, std::span<const float> heights_m, std::span<float> work_m,
+             std::int32_t cols, std::span<const BorderSegment> segments, std::vector<std::uint16_t>& zone,
+             TinCriterion criterion, double tie_cells);
 
   struct Outcome {
     std::size_t insertions = 0;
-    double error_m = 0;                // largest error left among the free posts
-    std::size_t best_insertions = 0;   // prefix with the smallest such error
+    double error_m = 0;               // largest error left among the free posts
+    std::size_t best_insertions = 0;  // prefix with the smallest such error
     double best_error_m = 0;
   };
-  // Inserts while some error exceeds bound_m, the mesh stays within max_triangles, and fewer than max_insertions were made.
+  // Inserts while some error exceeds bound_m, the mesh stays within max_triangles, and fewer than
+  // max_insertions were made.
   Outcome run(double bound_m, std::size_t max_triangles, std::size_t max_insertions);
 
  private:

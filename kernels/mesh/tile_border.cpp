@@ -5,10 +5,13 @@
 
 namespace lodestone {
 
-std::vector<std::int32_t> simplify_edge(std::span<const float> heights_m, std::span<const std::uint8_t> is_required,
+std::vector<std::int32_t> simplify_edge(std::span<const float> heights_m,
+                                        std::span<const std::uint8_t> is_required,
                                         std::span<const std::uint8_t> is_void, double tolerance_m) {
   const auto count = static_cast<std::int32_t>(heights_m.size());
-  const auto height = [&](std::int32_t k) { return static_cast<double>(heights_m[static_cast<std::size_t>(k)]); };
+  const auto height = [&](std::int32_t k) {
+    return static_cast<double>(heights_m[static_cast<std::size_t>(k)]);
+  };
   std::vector<std::uint8_t> keep(heights_m.size(), 0);
   std::vector<std::pair<std::int32_t, std::int32_t>> stack;
   std::int32_t from = 0;

@@ -5,7 +5,8 @@
 
 namespace lodestone {
 
-std::int64_t in_circle(const LatticePoint& a, const LatticePoint& b, const LatticePoint& c, const LatticePoint& d) {
+std::int64_t in_circle(const LatticePoint& a, const LatticePoint& b, const LatticePoint& c,
+                       const LatticePoint& d) {
   const std::int64_t ax = a.col - d.col, ay = d.row - a.row;
   const std::int64_t bx = b.col - d.col, by = d.row - b.row;
   const std::int64_t cx = c.col - d.col, cy = d.row - c.row;
@@ -144,7 +145,8 @@ void Triangulation::flip(std::int32_t e) {
   const std::int32_t b = origin(e), d = origin(f), a = apex(e), c = apex(f);
   const std::int32_t ab = prev(e), da = next(e), bc = next(f), cd = prev(f);
   const std::int32_t t_ab = twin(ab), t_da = twin(da), t_bc = twin(bc), t_cd = twin(cd);
-  const std::int32_t k_ab = constraint(ab), k_da = constraint(da), k_bc = constraint(bc), k_cd = constraint(cd);
+  const std::int32_t k_ab = constraint(ab), k_da = constraint(da), k_bc = constraint(bc),
+                     k_cd = constraint(cd);
   set(3 * t, a, t_ab, k_ab);
   set(3 * t + 1, b, t_bc, k_bc);
   set(3 * t + 2, c, 3 * u, kNone);
@@ -219,7 +221,8 @@ bool Triangulation::add_constraint(std::int32_t u, std::int32_t v, std::int32_t 
     std::int32_t first = kNone;
     for_each_outgoing(u, [&](std::int32_t o) {
       const std::int32_t across = next(o);
-      if (orient(pu, pv, point(origin(across))) < 0 && orient(pu, pv, point(destination(across))) > 0) first = across;
+      if (orient(pu, pv, point(origin(across))) < 0 && orient(pu, pv, point(destination(across))) > 0)
+        first = across;
       return first == kNone;
     });
     if (first == kNone || is_fixed(first)) return false;
@@ -265,7 +268,8 @@ void Triangulation::relax() {
     has_changed = false;
     for (std::int32_t e = 0; e < static_cast<std::int32_t>(origin_.size()); ++e) {
       if (is_fixed(e) || e > twin(e)) continue;
-      if (in_circle(point(origin(e)), point(destination(e)), point(apex(e)), point(apex(twin(e)))) <= 0) continue;
+      if (in_circle(point(origin(e)), point(destination(e)), point(apex(e)), point(apex(twin(e)))) <= 0)
+        continue;
       flip(e);
       has_changed = true;
     }

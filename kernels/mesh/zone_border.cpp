@@ -12,7 +12,9 @@ namespace {
 // Directions E, S, W, N as (dcol, drow).
 constexpr std::array<LatticePoint, 4> kStep{{{1, 0}, {0, 1}, {-1, 0}, {0, -1}}};
 
-bool precedes(const LatticePoint& a, const LatticePoint& b) { return a.row < b.row || (a.row == b.row && a.col < b.col); }
+bool precedes(const LatticePoint& a, const LatticePoint& b) {
+  return a.row < b.row || (a.row == b.row && a.col < b.col);
+}
 
 double squared_distance_to_segment(const LatticePoint& p, const LatticePoint& a, const LatticePoint& b) {
   const std::int64_t dx = b.col - a.col, dy = b.row - a.row;
@@ -93,8 +95,8 @@ struct Segment {
 };
 
 bool is_between(const LatticePoint& p, const LatticePoint& a, const LatticePoint& b) {
-  return p.col >= std::min(a.col, b.col) && p.col <= std::max(a.col, b.col) && p.row >= std::min(a.row, b.row) &&
-         p.row <= std::max(a.row, b.row);
+  return p.col >= std::min(a.col, b.col) && p.col <= std::max(a.col, b.col) &&
+         p.row >= std::min(a.row, b.row) && p.row <= std::max(a.row, b.row);
 }
 bool is_inside(const LatticePoint& p, const LatticePoint& a, const LatticePoint& b) {
   return p != a && p != b && is_between(p, a, b) && orient(a, b, p) == 0;
@@ -103,7 +105,8 @@ bool is_inside(const LatticePoint& p, const LatticePoint& a, const LatticePoint&
 // May s and t both be edges of one triangulation?
 bool is_compatible(const Segment& s, const Segment& t) {
   if ((s.a == t.a && s.b == t.b) || (s.a == t.b && s.b == t.a)) return false;
-  if (is_inside(s.a, t.a, t.b) || is_inside(s.b, t.a, t.b) || is_inside(t.a, s.a, s.b) || is_inside(t.b, s.a, s.b)) {
+  if (is_inside(s.a, t.a, t.b) || is_inside(s.b, t.a, t.b) || is_inside(t.a, s.a, s.b) ||
+      is_inside(t.b, s.a, s.b)) {
     return false;
   }
   const std::int64_t o1 = orient(s.a, s.b, t.a), o2 = orient(s.a, s.b, t.b);
@@ -112,11 +115,13 @@ bool is_compatible(const Segment& s, const Segment& t) {
 }
 
 bool lies_on_edge(const Segment& s, std::int32_t cols, std::int32_t rows) {
-  return (s.a.col == s.b.col && (s.a.col == 0 || s.a.col == cols)) || (s.a.row == s.b.row && (s.a.row == 0 || s.a.row == rows));
+  return (s.a.col == s.b.col && (s.a.col == 0 || s.a.col == cols)) ||
+         (s.a.row == s.b.row && (s.a.row == 0 || s.a.row == rows));
 }
 
 // Chains of which some segment breaks a rule. cols, rows: cells.
-std::vector<std::uint8_t> illegal_chains(const std::vector<ZoneChain>& chains, std::int32_t cols, std::int32_t rows) {
+std::vector<std::uint8_t> illegal_chains(const std::vector<ZoneChain>& chains, std::int32_t cols,
+                                         std::int32_t rows) {
   constexpr int kBucketShift = 4;
   std::vector<std::uint8_t> is_illegal(chains.size(), 0);
   std::vector<Segment> segments;
@@ -135,10 +140,12 @@ std::vector<std::uint8_t> illegal_chains(const std::vector<ZoneChain>& chains, s
     const auto [r0, r1] = std::minmax(segments[s].a.row, segments[s].b.row);
     for (std::int32_t r = r0 >> kBucketShift; r <= r1 >> kBucketShift; ++r) {
       for (std::int32_t c = c0 >> kBucketShift; c <= c1 >> kBucketShift; ++c) {
-        auto& bucket = buckets[static_cast<std::size_t>(r) * static_cast<std::size_t>(width) + static_cast<std::size_t>(c)];
+        auto& bucket = buckets[static_cast<std::size_t>(r) * static_cast<std::size_t>(width) +
+                               static_cast<std::size_t>(c)];
         for (const std::uint32_t t : bucket) {
           if (is_illegal[segments[s].chain] && is_illegal[segments[t].chain]) continue;
-          if (!is_compatible(segments[s], segments[t])) is_illegal[segments[s].chain] = is_illegal[segments[t].chain] = 1;
+          if (!is_compatible(segments[s], segments[t]))
+            is_illegal[segments[s].chain] = is_illegal[segments[t].chain] = 1;
         }
         bucket.push_back(s);
       }
@@ -152,7 +159,8 @@ std::vector<std::uint8_t> illegal_chains(const std::vector<ZoneChain>& chains, s
 std::uint16_t CellLabels::at(std::int32_t col, std::int32_t row) const {
   const std::int32_t c = std::clamp(col, -halo, cols + halo - 1) + halo;
   const std::int32_t r = std::clamp(row, -halo, rows + halo - 1) + halo;
-  return labels[static_cast<std::size_t>(r) * static_cast<std::size_t>(cols + 2 * halo) + static_cast<std::size_t>(c)];
+  return labels[static_cast<std::size_t>(r) * static_cast<std::size_t>(cols + 2 * halo) +
+                static_cast<std::size_t>(c)];
 }
 
 void sieve_zones(CellLabels& map, std::int32_t min_cells) {
@@ -173,15 +181,19 @@ void sieve_zones(CellLabels& map, std::int32_t min_cells) {
         for (const LatticePoint& d : kStep) {
           if (c + d.col < 0 || c + d.col >= width || r + d.row < 0 || r + d.row >= height) continue;
           const std::int32_t n = (r + d.row) * width + c + d.col;
-          if (region[static_cast<std::size_t>(n)] >= 0 || map.labels[static_cast<std::size_t>(n)] != map.labels[i]) continue;
+          if (region[static_cast<std::size_t>(n)] >= 0 ||
+              map.labels[static_cast<std::size_t>(n)] != map.labels[i])
+            continue;
           region[static_cast<std::size_t>(n)] = id;
           cells.back().push_back(n);
         }
       }
     }
-    const auto smallest = std::min_element(cells.begin(), cells.end(), [](const auto& a, const auto& b) { return a.size() < b.size(); });
+    const auto smallest = std::min_element(cells.begin(), cells.end(),
+                                           [](const auto& a, const auto& b) { return a.size() < b.size(); });
     if (cells.size() < 2 || static_cast<std::int64_t>(smallest->size()) >= min_cells) return;
-    // Every region of the smallest size joins its neighbour; those that touch one another wait for the next round.
+    // Every region of the smallest size joins its neighbour; those that touch one another wait for the next
+    // round.
     const std::size_t size = smallest->size();
     std::vector<std::uint8_t> is_changed(cells.size(), 0);
     for (std::size_t id = 0; id < cells.size(); ++id) {
@@ -199,7 +211,8 @@ void sieve_zones(CellLabels& map, std::int32_t min_cells) {
         }
       }
       if (!is_free) continue;
-      const auto best = std::max_element(contact.begin(), contact.end(), [](const auto& a, const auto& b) { return a.second < b.second; });
+      const auto best = std::max_element(contact.begin(), contact.end(),
+                                         [](const auto& a, const auto& b) { return a.second < b.second; });
       for (const std::int32_t cell : cells[id]) map.labels[static_cast<std::size_t>(cell)] = best->first;
       is_changed[id] = 1;
     }
@@ -231,7 +244,8 @@ CellLabels with_transitions(const CellLabels& map, std::int32_t width) {
   return marked;
 }
 
-float transition_blend(const CellLabels& marked, std::int32_t col, std::int32_t row, int a, int b, std::int32_t reach) {
+float transition_blend(const CellLabels& marked, std::int32_t col, std::int32_t row, int a, int b,
+                       std::int32_t reach) {
   double near_a = reach + 1, near_b = reach + 1;
   near_a *= near_a;
   near_b *= near_b;
@@ -279,15 +293,28 @@ std::vector<ZoneChain> trace_zone_borders(const CellLabels& map) {
     // Cells beside the first step, north up: left of east is north.
     const std::int32_t c = std::min(p.col, p.col + d0.col), r = std::min(p.row, p.row + d0.row);
     switch (direction) {
-      case 0: chain.left = map.at(c, r - 1); chain.right = map.at(c, r); break;
-      case 1: chain.left = map.at(c, r); chain.right = map.at(c - 1, r); break;
-      case 2: chain.left = map.at(c, r); chain.right = map.at(c, r - 1); break;
-      default: chain.left = map.at(c - 1, r); chain.right = map.at(c, r); break;
+      case 0:
+        chain.left = map.at(c, r - 1);
+        chain.right = map.at(c, r);
+        break;
+      case 1:
+        chain.left = map.at(c, r);
+        chain.right = map.at(c - 1, r);
+        break;
+      case 2:
+        chain.left = map.at(c, r);
+        chain.right = map.at(c, r - 1);
+        break;
+      default:
+        chain.left = map.at(c - 1, r);
+        chain.right = map.at(c, r);
+        break;
     }
     chain.points.push_back(p);
     while (true) {
       used[index(p)] = static_cast<std::uint8_t>(used[index(p)] | 1 << direction);
-      p = {p.col + kStep[static_cast<std::size_t>(direction)].col, p.row + kStep[static_cast<std::size_t>(direction)].row};
+      p = {p.col + kStep[static_cast<std::size_t>(direction)].col,
+           p.row + kStep[static_cast<std::size_t>(direction)].row};
       const int back = (direction + 2) % 4;
       used[index(p)] = static_cast<std::uint8_t>(used[index(p)] | 1 << back);
       chain.points.push_back(p);
@@ -314,8 +341,8 @@ std::vector<ZoneChain> trace_zone_borders(const CellLabels& map) {
   return chains;
 }
 
-std::vector<ZoneChain> simplify_zone_borders(const std::vector<ZoneChain>& unit_chains, std::int32_t cols, std::int32_t rows,
-                                             double epsilon, std::uint16_t exact_label) {
+std::vector<ZoneChain> simplify_zone_borders(const std::vector<ZoneChain>& unit_chains, std::int32_t cols,
+                                             std::int32_t rows, double epsilon, std::uint16_t exact_label) {
   std::vector<double> epsilons(unit_chains.size(), epsilon);
   std::vector<ZoneChain> result = unit_chains;
   for (std::size_t c = 0; c < result.size(); ++c) {

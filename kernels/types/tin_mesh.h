@@ -34,8 +34,8 @@ struct TinMesh {
   std::vector<TinVertex> vertices;
   std::vector<std::uint32_t> triangles;  // 3 per triangle, counter-clockwise seen from above with north up
   std::vector<std::uint16_t> zones;      // one per triangle, or empty
-  std::vector<float> blend;              // 3 per triangle: share 0..1 of second_zone() at its corners; or empty
-  std::vector<float> normals;            // 3 per vertex: east, north, up, unit length; or empty
+  std::vector<float> blend;    // 3 per triangle: share 0..1 of second_zone() at its corners; or empty
+  std::vector<float> normals;  // 3 per vertex: east, north, up, unit length; or empty
 
   // Vertices and triangles from these indices on are skirt; the top surface comes first.
   std::size_t top_vertices = 0, top_triangles = 0;
@@ -48,7 +48,8 @@ struct TinMesh {
   std::size_t triangle_count() const { return triangles.size() / 3; }
 };
 
-// Top vertices on each side of the mesh. west and east run from the south end, south and north from the west end.
+// Top vertices on each side of the mesh. west and east run from the south end, south and north from the west
+// end.
 struct TinBorder {
   std::vector<std::uint32_t> west, south, east, north;
 };
@@ -62,8 +63,12 @@ inline TinBorder border_of(const TinMesh& mesh) {
     if (p.row == 0) border.north.push_back(v);
     if (p.row == mesh.rows - 1) border.south.push_back(v);
   }
-  const auto northwards = [&](std::uint32_t a, std::uint32_t b) { return mesh.vertices[a].row > mesh.vertices[b].row; };
-  const auto eastwards = [&](std::uint32_t a, std::uint32_t b) { return mesh.vertices[a].col < mesh.vertices[b].col; };
+  const auto northwards = [&](std::uint32_t a, std::uint32_t b) {
+    return mesh.vertices[a].row > mesh.vertices[b].row;
+  };
+  const auto eastwards = [&](std::uint32_t a, std::uint32_t b) {
+    return mesh.vertices[a].col < mesh.vertices[b].col;
+  };
   std::sort(border.west.begin(), border.west.end(), northwards);
   std::sort(border.east.begin(), border.east.end(), northwards);
   std::sort(border.south.begin(), border.south.end(), eastwards);

@@ -25,12 +25,14 @@ class BinaryWriter {
  public:
   // stride: bytes between elements (a multiple of 4 for vertex data), 0 for indices.
   template <class T>
-  int add(const std::vector<T>& values, int components, int component_type, int stride, bool is_normalized, bool has_range) {
+  int add(const std::vector<T>& values, int components, int component_type, int stride, bool is_normalized,
+          bool has_range) {
     while (bytes_.size() % 4 != 0) bytes_.push_back('\0');
     const std::size_t offset = bytes_.size(), count = values.size() / static_cast<std::size_t>(components);
     const std::size_t packed = sizeof(T) * static_cast<std::size_t>(components);
     for (std::size_t i = 0; i < count; ++i) {
-      bytes_.append(reinterpret_cast<const char*>(values.data() + i * static_cast<std::size_t>(components)), packed);
+      bytes_.append(reinterpret_cast<const char*>(values.data() + i * static_cast<std::size_t>(components)),
+                    packed);
       if (stride > 0) bytes_.append(static_cast<std::size_t>(stride) - packed, '\0');
     }
     Json view{{"buffer", 0}, {"byteOffset", offset}, {"byteLength", bytes_.size() - offset}};
@@ -38,7 +40,10 @@ class BinaryWriter {
     view["target"] = stride > 0 ? kArrayBuffer : kElementBuffer;
     views_.push_back(view);
     static constexpr std::array<const char*, 4> kTypes{"", "SCALAR", "VEC2", "VEC3"};
-    Json accessor{{"bufferView", views_.size() - 1}, {"componentType", component_type}, {"count", count}, {"type", kTypes[static_cast<std::size_t>(components)]}};
+    Json accessor{{"bufferView", views_.size() - 1},
+                  {"componentType", component_type},
+                  {"count", count},
+                  {"type", kTypes[static_cast<std::size_t>(components)]}};
     if (is_normalized) accessor["normalized"] = true;
     if (has_range) {
       std::vector<T> low(values.begin(), values.begin() + components), high = low;
@@ -99,7 +104,8 @@ std::vector<Part> parts_of(const TinMesh& mesh) {
 
 std::string zone_name(std::uint16_t zone, const GlbOptions& options) {
   if (const auto it = options.zone_names.find(zone); it != options.zone_names.end()) return it->second;
-  if (is_transition(zone)) return "zones " + std::to_string(first_zone(zone)) + "-" + std::to_string(second_zone(zone));
+  if (is_transition(zone))
+    return "zones " + std::to_string(first_zone(zone)) + "-" + std::to_string(second_zone(zone));
   return "zone " + std::to_string(zone);
 }
 
@@ -116,7 +122,10 @@ std::array<double, 3> zone_colour(int zone) {
 
 Json material_of(const std::string& name, const std::array<double, 3>& rgb) {
   return {{"name", name},
-          {"pbrMetallicRoughness", {{"baseColorFactor", {rgb[0], rgb[1], rgb[2], 1.0}}, {"metallicFactor", 0.0}, {"roughnessFactor", 1.0}}}};
+          {"pbrMetallicRoughness",
+           {{"baseColorFactor", {rgb[0], rgb[1], rgb[2], 1.0}},
+            {"metallicFactor", 0.0},
+            {"roughnessFactor", 1.0}}}};
 }
 
 struct Lattice {
@@ -135,14 +144,18 @@ class GlbWriter {
  public:
   GlbWriter(const TinMesh& mesh, const GlbOptions& options) : mesh_(mesh), options_(options) {
     const auto* plane = std::get_if<PlanarFrame>(&options.frame);
-    placed_ = plane != nullptr ? placed_on_plane(mesh, *plane) : placed_on_ellipsoid(mesh, std::get<GeodeticFrame>(options.frame));
+    placed_ = plane != nullptr ? placed_on_plane(mesh, *plane)
+                               : placed_on_ellipsoid(mesh, std::get<GeodeticFrame>(options.frame));
     lattice_ = lattice_of(mesh);
   }
 
   std::string write() {
     Json primitives = Json::array(), materials = Json::array();
     for (const Part& part : parts_of(mesh_)) {
-      Json primitive{{"attributes", attributes_of(part)}, {"indices", add_indices(part)}, {"material", materials.size()}, {"mode", 4}};
+      Json primitive{{"attributes", attributes_of(part)},
+                     {"indices", add_indices(part)},
+                     {"material", materials.size()},
+                     {"mode", 4}};
       if (part.zone >= 0) {
         const auto zone = static_cast<std::uint16_t>(part.zone);
         primitive["extras"] = {{"zone", part.zone}};
@@ -154,11 +167,13 @@ class GlbWriter {
       primitives.push_back(primitive);
     }
     Json json{{"asset", {{"version", "2.0"}, {"generator", "Lodestone"}}}};
-    if (options_.is_quantized) json["extensionsUsed"] = json["extensionsRequired"] = {"KHR_mesh_quantization"};
+    if (options_.is_quantized)
+      json["extensionsUsed"] = json["extensionsRequired"] = {"KHR_mesh_quantization"};
     json["scene"] = 0;
     json["scenes"] = Json::array({{{"nodes", {0}}}});
     json["nodes"] = Json::array({node()});
-    json["meshes"] = Json::array({{{"name", options_.name}, {"primitives", primitives}, {"extras", extras()}}});
+    json["meshes"] =
+        Json::array({{{"name", options_.name}, {"primitives", primitives}, {"extras", extras()}}});
     json["materials"] = materials;
     json["accessors"] = binary_.accessors_;
     json["bufferViews"] = binary_.views_;
@@ -172,7 +187,8 @@ class GlbWriter {
     std::vector<T> result;
     result.reserve(part.vertices.size() * components);
     for (const std::uint32_t v : part.vertices) {
-      result.insert(result.end(), values.begin() + static_cast<std::ptrdiff_t>(v * components), values.begin() + static_cast<std::ptrdiff_t>((v + 1) * components));
+      result.insert(result.end(), values.begin() + static_cast<std::ptrdiff_t>(v * components),
+                    values.begin() + static_cast<std::ptrdiff_t>((v + 1) * components));
     }
     return result;
   }
@@ -183,18 +199,23 @@ class GlbWriter {
       std::vector<std::uint16_t> positions;
       for (const std::uint32_t v : part.vertices) {
         const TinVertex& p = mesh_.vertices[v];
-        positions.insert(positions.end(), {static_cast<std::uint16_t>(p.col), static_cast<std::uint16_t>(std::floor((p.height_m - lattice_.base_m) / lattice_.step_m + 0.5)),
-                                           static_cast<std::uint16_t>(p.row)});
+        positions.insert(
+            positions.end(),
+            {static_cast<std::uint16_t>(p.col),
+             static_cast<std::uint16_t>(std::floor((p.height_m - lattice_.base_m) / lattice_.step_m + 0.5)),
+             static_cast<std::uint16_t>(p.row)});
       }
       attributes["POSITION"] = binary_.add(positions, 3, kUnsignedShort, 8, false, true);
       if (!placed_.normals.empty()) {
         std::vector<std::int8_t> normals;
-        for (const float n : picked(part, placed_.normals, 3)) normals.push_back(static_cast<std::int8_t>(std::floor(n * 127 + 0.5F)));
+        for (const float n : picked(part, placed_.normals, 3))
+          normals.push_back(static_cast<std::int8_t>(std::floor(n * 127 + 0.5F)));
         attributes["NORMAL"] = binary_.add(normals, 3, kByte, 4, true, false);
       }
     } else {
       attributes["POSITION"] = binary_.add(picked(part, placed_.positions, 3), 3, kFloat, 12, false, true);
-      if (!placed_.normals.empty()) attributes["NORMAL"] = binary_.add(picked(part, placed_.normals, 3), 3, kFloat, 12, false, false);
+      if (!placed_.normals.empty())
+        attributes["NORMAL"] = binary_.add(picked(part, placed_.normals, 3), 3, kFloat, 12, false, false);
     }
     attributes["TEXCOORD_0"] = binary_.add(uvs_of(part), 2, kFloat, 8, false, false);
     if (!part.blend.empty()) attributes["_BLEND"] = binary_.add(part.blend, 1, kFloat, 4, false, false);
@@ -207,9 +228,12 @@ class GlbWriter {
     for (const std::uint32_t v : part.vertices) {
       const TinVertex& p = mesh_.vertices[v];
       if (plane != nullptr && options_.texture_size_m) {
-        // Metres from the layer's origin, less the whole repeats at the tile's edge: neighbours differ by whole repeats only.
+        // Metres from the layer's origin, less the whole repeats at the tile's edge: neighbours differ by
+        // whole repeats only.
         const double size = *options_.texture_size_m;
-        const auto share = [size](double edge_m, double offset_m) { return (edge_m + offset_m - size * std::floor(edge_m / size)) / size; };
+        const auto share = [size](double edge_m, double offset_m) {
+          return (edge_m + offset_m - size * std::floor(edge_m / size)) / size;
+        };
         uvs.push_back(static_cast<float>(share(plane->west_m, p.col * plane->spacing_x_m)));
         uvs.push_back(static_cast<float>(share(plane->north_m, p.row * plane->spacing_y_m)));
       } else {
@@ -221,8 +245,10 @@ class GlbWriter {
   }
 
   int add_indices(const Part& part) {
-    if (part.vertices.size() > 65535) return binary_.add(part.indices, 1, kUnsignedInt, 0, false, false);  // 65535 itself restarts primitives
-    return binary_.add(std::vector<std::uint16_t>(part.indices.begin(), part.indices.end()), 1, kUnsignedShort, 0, false, false);
+    if (part.vertices.size() > 65535)
+      return binary_.add(part.indices, 1, kUnsignedInt, 0, false, false);  // 65535 itself restarts primitives
+    return binary_.add(std::vector<std::uint16_t>(part.indices.begin(), part.indices.end()), 1,
+                       kUnsignedShort, 0, false, false);
   }
 
   Json node() const {
@@ -238,8 +264,11 @@ class GlbWriter {
   }
 
   Json extras() const {
-    Json extras{{"maxErrorM", mesh_.max_error_m + (options_.is_quantized ? lattice_.step_m / 2 : 0)}, {"rmsErrorM", mesh_.rms_error_m}, {"skirtDepthM", mesh_.skirt_depth_m},
-                {"posts", {mesh_.cols, mesh_.rows}}, {"origin", {mesh_.i0, mesh_.j0}}};
+    Json extras{{"maxErrorM", mesh_.max_error_m + (options_.is_quantized ? lattice_.step_m / 2 : 0)},
+                {"rmsErrorM", mesh_.rms_error_m},
+                {"skirtDepthM", mesh_.skirt_depth_m},
+                {"posts", {mesh_.cols, mesh_.rows}},
+                {"origin", {mesh_.i0, mesh_.j0}}};
     if (mesh_.zones.empty()) {
       extras["topVertices"] = mesh_.top_vertices;
       extras["topTriangles"] = mesh_.top_triangles;
@@ -278,12 +307,17 @@ class GlbWriter {
 }  // namespace
 
 Result<std::string> encode_glb(const TinMesh& mesh, const GlbOptions& options) {
-  if (mesh.triangles.empty()) return Error{ErrorCode::kInvalidArgument, "GLB: the mesh has no triangles; a tile of nothing but voids has no GLB"};
-  if (mesh.triangles.size() > (std::size_t{1} << 26)) return Error{ErrorCode::kTooLarge, "GLB: at most 2^26 indices, found " + std::to_string(mesh.triangles.size())};
+  if (mesh.triangles.empty())
+    return Error{ErrorCode::kInvalidArgument,
+                 "GLB: the mesh has no triangles; a tile of nothing but voids has no GLB"};
+  if (mesh.triangles.size() > (std::size_t{1} << 26))
+    return Error{ErrorCode::kTooLarge,
+                 "GLB: at most 2^26 indices, found " + std::to_string(mesh.triangles.size())};
   if (options.is_quantized && !std::holds_alternative<PlanarFrame>(options.frame)) {
     return Error{ErrorCode::kInvalidArgument, "GLB: quantised positions need a planar frame; ask for floats"};
   }
-  if (options.texture_size_m && !(*options.texture_size_m > 0)) return Error{ErrorCode::kInvalidArgument, "GLB: the texture size must be > 0 m"};
+  if (options.texture_size_m && !(*options.texture_size_m > 0))
+    return Error{ErrorCode::kInvalidArgument, "GLB: the texture size must be > 0 m"};
   return GlbWriter(mesh, options).write();
 }
 
@@ -308,16 +342,21 @@ Result<View> accessor_view(const Json& json, std::span<const std::uint8_t> bin, 
   View result{};
   result.components = type == "SCALAR" ? 1 : type == "VEC2" ? 2 : type == "VEC3" ? 3 : 0;
   result.component_type = accessor.at("componentType").get<int>();
-  const bool is_known = result.component_type == kByte || result.component_type == kUnsignedShort || result.component_type == kUnsignedInt || result.component_type == kFloat;
-  if (result.components == 0 || !is_known) return Error{ErrorCode::kUnsupported, "GLB: accessor " + std::to_string(number) + " has a type that we do not write"};
+  const bool is_known = result.component_type == kByte || result.component_type == kUnsignedShort ||
+                        result.component_type == kUnsignedInt || result.component_type == kFloat;
+  if (result.components == 0 || !is_known)
+    return Error{ErrorCode::kUnsupported,
+                 "GLB: accessor " + std::to_string(number) + " has a type that we do not write"};
   result.is_normalized = accessor.value("normalized", false);
   result.count = accessor.at("count").get<std::size_t>();
   const std::size_t size = component_size(result.component_type) * result.components;
   result.stride = view.value("byteStride", size);
-  const std::size_t view_at = view.value("byteOffset", std::size_t{0}), view_length = view.at("byteLength").get<std::size_t>();
+  const std::size_t view_at = view.value("byteOffset", std::size_t{0}),
+                    view_length = view.at("byteLength").get<std::size_t>();
   const std::size_t at = accessor.value("byteOffset", std::size_t{0});
-  if (view_at > bin.size() || view_length > bin.size() - view_at || at > view_length || result.stride < size || result.count == 0 ||
-      size > view_length - at || result.count - 1 > (view_length - at - size) / result.stride) {
+  if (view_at > bin.size() || view_length > bin.size() - view_at || at > view_length ||
+      result.stride < size || result.count == 0 || size > view_length - at ||
+      result.count - 1 > (view_length - at - size) / result.stride) {
     return corrupt("accessor " + std::to_string(number) + " reaches outside its buffer");
   }
   result.bytes = bin.subspan(view_at + at, view_length - at);
@@ -349,7 +388,8 @@ double component(const View& view, std::size_t element, std::size_t k) {
   }
 }
 
-Result<DecodedGlb> decode_chunks(std::span<const std::uint8_t> json_bytes, std::span<const std::uint8_t> bin, std::size_t max_bytes) {
+Result<DecodedGlb> decode_chunks(std::span<const std::uint8_t> json_bytes, std::span<const std::uint8_t> bin,
+                                 std::size_t max_bytes) {
   DecodedGlb decoded;
   decoded.json.assign(json_bytes.begin(), json_bytes.end());
   const Json json = Json::parse(decoded.json);
@@ -359,16 +399,20 @@ Result<DecodedGlb> decode_chunks(std::span<const std::uint8_t> json_bytes, std::
   std::size_t charged = 0;
   for (const Json& primitive : json.at("meshes").at(0).at("primitives")) {
     GlbPrimitive out;
-    const auto read = [&](const char* name, std::size_t components, std::vector<float>& values) -> Result<void> {
+    const auto read = [&](const char* name, std::size_t components,
+                          std::vector<float>& values) -> Result<void> {
       const Json& attributes = primitive.at("attributes");
       if (!attributes.contains(name)) return {};
       Result<View> view = accessor_view(json, bin, attributes[name].get<std::size_t>());
       if (!view) return std::move(view.error());
-      if (view->components != components) return corrupt(std::string(name) + " has the wrong number of components");
+      if (view->components != components)
+        return corrupt(std::string(name) + " has the wrong number of components");
       charged += view->count * components * sizeof(float);
-      if (charged > max_bytes) return Error{ErrorCode::kTooLarge, "GLB: more than " + std::to_string(max_bytes) + " bytes decoded"};
+      if (charged > max_bytes)
+        return Error{ErrorCode::kTooLarge, "GLB: more than " + std::to_string(max_bytes) + " bytes decoded"};
       for (std::size_t i = 0; i < view->count; ++i) {
-        for (std::size_t k = 0; k < components; ++k) values.push_back(static_cast<float>(component(*view, i, k)));
+        for (std::size_t k = 0; k < components; ++k)
+          values.push_back(static_cast<float>(component(*view, i, k)));
       }
       return {};
     };
@@ -378,12 +422,17 @@ Result<DecodedGlb> decode_chunks(std::span<const std::uint8_t> json_bytes, std::
     if (Result<void> r = read("_BLEND", 1, out.blend); !r) return std::move(r.error());
     Result<View> indices = accessor_view(json, bin, primitive.at("indices").get<std::size_t>());
     if (!indices) return std::move(indices.error());
-    if (indices->components != 1 || (indices->component_type != kUnsignedShort && indices->component_type != kUnsignedInt)) return corrupt("indices of a wrong type");
+    if (indices->components != 1 ||
+        (indices->component_type != kUnsignedShort && indices->component_type != kUnsignedInt))
+      return corrupt("indices of a wrong type");
     charged += indices->count * sizeof(std::uint32_t);
-    if (charged > max_bytes) return Error{ErrorCode::kTooLarge, "GLB: more than " + std::to_string(max_bytes) + " bytes decoded"};
+    if (charged > max_bytes)
+      return Error{ErrorCode::kTooLarge, "GLB: more than " + std::to_string(max_bytes) + " bytes decoded"};
     for (std::size_t i = 0; i < indices->count; ++i) {
       const auto index = static_cast<std::uint32_t>(component(*indices, i, 0));
-      if (index >= out.positions.size() / 3) return corrupt("index " + std::to_string(index) + " of " + std::to_string(out.positions.size() / 3) + " vertices");
+      if (index >= out.positions.size() / 3)
+        return corrupt("index " + std::to_string(index) + " of " + std::to_string(out.positions.size() / 3) +
+                       " vertices");
       out.indices.push_back(index);
     }
     if (primitive.contains("extras")) out.zone = primitive["extras"].value("zone", -1);
@@ -401,13 +450,17 @@ Result<DecodedGlb> decode_glb(std::span<const std::uint8_t> bytes, std::size_t m
     return w;
   };
   if (bytes.size() < 20 || word(0) != kMagic) return corrupt("the file does not begin with a glTF header");
-  if (word(4) != kVersion) return Error{ErrorCode::kUnsupported, "GLB: version 2 expected, found " + std::to_string(word(4))};
-  if (word(8) != bytes.size()) return corrupt(std::to_string(word(8)) + " bytes declared, " + std::to_string(bytes.size()) + " found");
+  if (word(4) != kVersion)
+    return Error{ErrorCode::kUnsupported, "GLB: version 2 expected, found " + std::to_string(word(4))};
+  if (word(8) != bytes.size())
+    return corrupt(std::to_string(word(8)) + " bytes declared, " + std::to_string(bytes.size()) + " found");
   const std::size_t json_length = word(12);
-  if (word(16) != kJsonChunk || json_length > bytes.size() - 20) return corrupt("the first chunk must be JSON inside the file");
+  if (word(16) != kJsonChunk || json_length > bytes.size() - 20)
+    return corrupt("the first chunk must be JSON inside the file");
   std::span<const std::uint8_t> bin;
   if (const std::size_t at = 20 + json_length; bytes.size() - at >= 8) {
-    if (word(at + 4) != kBinChunk || word(at) > bytes.size() - at - 8) return corrupt("the second chunk must be BIN inside the file");
+    if (word(at + 4) != kBinChunk || word(at) > bytes.size() - at - 8)
+      return corrupt("the second chunk must be BIN inside the file");
     bin = bytes.subspan(at + 8, word(at));
   }
   try {

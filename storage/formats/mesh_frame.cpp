@@ -13,7 +13,8 @@ constexpr double kEccentricity2 = kFlattening * (2 - kFlattening);
 double radians(double deg) { return deg * std::numbers::pi / 180; }
 double mercator(double lat_deg) { return std::asinh(std::tan(radians(lat_deg))); }
 
-// Lowest and highest vertex, rounded to the middle in whole metres: keeps float32 heights exact to the millimetre.
+// Lowest and highest vertex, rounded to the middle in whole metres: keeps float32 heights exact to the
+// millimetre.
 double base_height_m(const TinMesh& mesh) {
   if (mesh.top_vertices == 0) return 0;
   const auto [low, high] = height_range(mesh);
@@ -40,8 +41,8 @@ Vec3 ecef_from_geodetic(double lon_deg, double lat_deg, double height_m) {
 Vec3 ecef_from_enu(double lon_deg, double lat_deg, const Vec3& enu) {
   const double lon = radians(lon_deg), lat = radians(lat_deg);
   const double sl = std::sin(lon), cl = std::cos(lon), sp = std::sin(lat), cp = std::cos(lat);
-  return {-sl * enu[0] - sp * cl * enu[1] + cp * cl * enu[2], cl * enu[0] - sp * sl * enu[1] + cp * sl * enu[2],
-          cp * enu[1] + sp * enu[2]};
+  return {-sl * enu[0] - sp * cl * enu[1] + cp * cl * enu[2],
+          cl * enu[0] - sp * sl * enu[1] + cp * sl * enu[2], cp * enu[1] + sp * enu[2]};
 }
 
 std::vector<Vec3> ecef_positions(const TinMesh& mesh, const GeodeticFrame& frame) {
@@ -49,7 +50,8 @@ std::vector<Vec3> ecef_positions(const TinMesh& mesh, const GeodeticFrame& frame
   positions.reserve(mesh.vertices.size());
   for (const TinVertex& v : mesh.vertices) {
     const double lon = frame.west_deg + (frame.east_deg - frame.west_deg) * v.col / (mesh.cols - 1);
-    positions.push_back(ecef_from_geodetic(lon, latitude_deg(frame, static_cast<double>(v.row) / (mesh.rows - 1)), v.height_m));
+    positions.push_back(ecef_from_geodetic(
+        lon, latitude_deg(frame, static_cast<double>(v.row) / (mesh.rows - 1)), v.height_m));
   }
   return positions;
 }
@@ -57,7 +59,8 @@ std::vector<Vec3> ecef_positions(const TinMesh& mesh, const GeodeticFrame& frame
 PlacedMesh placed_on_plane(const TinMesh& mesh, const PlanarFrame& frame) {
   PlacedMesh placed;
   const double mid_col = (mesh.cols - 1) / 2.0, mid_row = (mesh.rows - 1) / 2.0, base = base_height_m(mesh);
-  placed.translation = {frame.west_m + mid_col * frame.spacing_x_m, base, frame.north_m + mid_row * frame.spacing_y_m};
+  placed.translation = {frame.west_m + mid_col * frame.spacing_x_m, base,
+                        frame.north_m + mid_row * frame.spacing_y_m};
   placed.positions.reserve(3 * mesh.vertices.size());
   for (const TinVertex& v : mesh.vertices) {
     placed.positions.push_back(static_cast<float>((v.col - mid_col) * frame.spacing_x_m));
@@ -85,9 +88,12 @@ PlacedMesh placed_on_ellipsoid(const TinMesh& mesh, const GeodeticFrame& frame) 
     const TinVertex& at = mesh.vertices[v];
     const double lon = frame.west_deg + (frame.east_deg - frame.west_deg) * at.col / (mesh.cols - 1);
     const double lat = latitude_deg(frame, static_cast<double>(at.row) / (mesh.rows - 1));
-    const Vec3 n = ecef_from_enu(lon, lat, {mesh.normals[3 * v], mesh.normals[3 * v + 1], mesh.normals[3 * v + 2]});
+    const Vec3 n =
+        ecef_from_enu(lon, lat, {mesh.normals[3 * v], mesh.normals[3 * v + 1], mesh.normals[3 * v + 2]});
     const double length = std::sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
-    placed.normals.insert(placed.normals.end(), {static_cast<float>(n[0] / length), static_cast<float>(n[2] / length), static_cast<float>(-n[1] / length)});
+    placed.normals.insert(placed.normals.end(),
+                          {static_cast<float>(n[0] / length), static_cast<float>(n[2] / length),
+                           static_cast<float>(-n[1] / length)});
   }
   return placed;
 }

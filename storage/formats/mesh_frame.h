@@ -1,5 +1,6 @@
 #pragma once
-// Where a tile's posts lie: from (col, row, height) to metres on a plane, to degrees, to Earth-centred metres.
+// Where a tile's posts lie: from (col, row, height) to metres on a plane, to degrees, to Earth-centred
+// metres.
 
 #include <array>
 #include <cstdint>
@@ -13,12 +14,12 @@ using Vec3 = std::array<double, 3>;
 
 // A plane: metres east and south of the layer's north-west post.
 struct PlanarFrame {
-  double west_m = 0, north_m = 0;              // of the mesh's north-west post, east and south of the layer's
-  double spacing_x_m = 1, spacing_y_m = 1;     // between posts, > 0
+  double west_m = 0, north_m = 0;           // of the mesh's north-west post, east and south of the layer's
+  double spacing_x_m = 1, spacing_y_m = 1;  // between posts, > 0
 };
 
-// A rectangle of the WGS84 ellipsoid, degrees; heights are metres above the ellipsoid. Posts are even in longitude, and in
-// latitude or (is_mercator) in spherical Mercator northing.
+// A rectangle of the WGS84 ellipsoid, degrees; heights are metres above the ellipsoid. Posts are even in
+// longitude, and in latitude or (is_mercator) in spherical Mercator northing.
 struct GeodeticFrame {
   double west_deg = 0, south_deg = 0, east_deg = 0, north_deg = 0;
   bool is_mercator = false;

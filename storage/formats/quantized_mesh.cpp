@@ -1,4 +1,5 @@
-// Layout: header, vertex deltas (zig-zag), indices (high-water mark), four edge lists, extensions. All little-endian.
+// Layout: header, vertex deltas (zig-zag), indices (high-water mark), four edge lists, extensions. All
+// little-endian.
 
 #include "storage/formats/quantized_mesh.h"
 
@@ -16,14 +17,19 @@ enum Extension : std::uint8_t { kOctNormals = 1, kWatermask = 2, kMetadata = 4 }
 
 double length(const Vec3& a) { return std::sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2]); }
 double dot(const Vec3& a, const Vec3& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-Vec3 cross(const Vec3& a, const Vec3& b) { return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]}; }
+Vec3 cross(const Vec3& a, const Vec3& b) {
+  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+}
 
-// Point on the line from the Earth's centre through `centre` that is below the horizon only when every position is; scaled so that
-// the ellipsoid is the unit sphere. A tile of half the Earth has no such point and gets one far out.
+// Point on the line from the Earth's centre through `centre` that is below the horizon only when every
+// position is; scaled so that the ellipsoid is the unit sphere. A tile of half the Earth has no such point
+// and gets one far out.
 Vec3 horizon_occlusion_point(const std::vector<Vec3>& positions, std::size_t count, const Vec3& centre) {
   constexpr Vec3 kRadii{6378137.0, 6378137.0, 6356752.3142451793};
   constexpr double kFarOut = 1e6;
-  const auto scaled = [&](const Vec3& p) { return Vec3{p[0] / kRadii[0], p[1] / kRadii[1], p[2] / kRadii[2]}; };
+  const auto scaled = [&](const Vec3& p) {
+    return Vec3{p[0] / kRadii[0], p[1] / kRadii[1], p[2] / kRadii[2]};
+  };
   Vec3 direction = scaled(centre);
   const double size = length(direction);
   if (size <= 0) return {kFarOut, 0, 0};
@@ -33,7 +39,8 @@ Vec3 horizon_occlusion_point(const std::vector<Vec3>& positions, std::size_t cou
     Vec3 p = scaled(positions[i]);
     const double m = length(p);
     for (double& x : p) x /= m;
-    const double above = std::max(m, 1.0);  // a point below the ellipsoid is hidden sooner than the one above it
+    const double above =
+        std::max(m, 1.0);  // a point below the ellipsoid is hidden sooner than the one above it
     const double cos_alpha = dot(p, direction), sin_alpha = length(cross(p, direction));
     const double cos_beta = 1 / above, sin_beta = std::sqrt(above * above - 1) * cos_beta;
     const double denominator = cos_alpha * cos_beta - sin_alpha * sin_beta;
@@ -49,16 +56,23 @@ struct Quantizer {
   const GeodeticFrame& frame;
   std::array<float, 2> range;
 
-  int u(const TinVertex& p) const { return static_cast<int>(std::floor(static_cast<double>(p.col) * kMax / (mesh.cols - 1) + 0.5)); }
+  int u(const TinVertex& p) const {
+    return static_cast<int>(std::floor(static_cast<double>(p.col) * kMax / (mesh.cols - 1) + 0.5));
+  }
   double v_exact(const TinVertex& p) const {
     const double share = static_cast<double>(p.row) / (mesh.rows - 1);
     if (!frame.is_mercator) return kMax * (1 - share);
     return kMax * (latitude_deg(frame, share) - frame.south_deg) / (frame.north_deg - frame.south_deg);
   }
-  int v(const TinVertex& p) const { return std::clamp(static_cast<int>(std::floor(v_exact(p) + 0.5)), 0, kMax); }
+  int v(const TinVertex& p) const {
+    return std::clamp(static_cast<int>(std::floor(v_exact(p) + 0.5)), 0, kMax);
+  }
   int height(const TinVertex& p) const {
     const double span = static_cast<double>(range[1]) - range[0];
-    return span > 0 ? std::clamp(static_cast<int>(std::floor((p.height_m - static_cast<double>(range[0])) / span * kMax + 0.5)), 0, kMax) : 0;
+    return span > 0 ? std::clamp(static_cast<int>(std::floor(
+                                     (p.height_m - static_cast<double>(range[0])) / span * kMax + 0.5)),
+                                 0, kMax)
+                    : 0;
   }
 };
 
@@ -86,7 +100,9 @@ std::array<std::uint8_t, 2> oct_encoded(const Vec3& n) {
     x = (1 - std::abs(y)) * (old_x < 0 ? -1 : 1);
     y = (1 - std::abs(old_x)) * (y < 0 ? -1 : 1);
   }
-  const auto byte = [](double a) { return static_cast<std::uint8_t>(std::floor((std::clamp(a, -1.0, 1.0) * 0.5 + 0.5) * 255 + 0.5)); };
+  const auto byte = [](double a) {
+    return static_cast<std::uint8_t>(std::floor((std::clamp(a, -1.0, 1.0) * 0.5 + 0.5) * 255 + 0.5));
+  };
   return {byte(x), byte(y)};
 }
 
@@ -103,9 +119,12 @@ Vec3 oct_decoded(std::uint8_t bx, std::uint8_t by) {
 }
 
 Result<std::string> encode_quantized_mesh(const TinMesh& mesh, const QuantizedMeshOptions& options) {
-  const auto refuse = [](const std::string& what) { return Error{ErrorCode::kInvalidArgument, "quantized-mesh: " + what}; };
+  const auto refuse = [](const std::string& what) {
+    return Error{ErrorCode::kInvalidArgument, "quantized-mesh: " + what};
+  };
   if (mesh.top_triangles == 0) return refuse("the mesh has no triangles");
-  if (options.has_normals && mesh.normals.size() < 3 * mesh.top_vertices) return refuse("normals were asked for, the mesh has none; call set_normals first");
+  if (options.has_normals && mesh.normals.size() < 3 * mesh.top_vertices)
+    return refuse("normals were asked for, the mesh has none; call set_normals first");
   if (options.watermask && options.watermask->size() != 1 && options.watermask->size() != 65536) {
     return refuse("a watermask has 1 or 65536 bytes, found " + std::to_string(options.watermask->size()));
   }
@@ -137,11 +156,13 @@ Result<std::string> encode_quantized_mesh(const TinMesh& mesh, const QuantizedMe
   double radius = 0;
   for (const std::uint32_t v : order) {
     const Vec3& p = positions[v];
-    radius = std::max(radius, length({p[0] - sphere_centre[0], p[1] - sphere_centre[1], p[2] - sphere_centre[2]}));
+    radius =
+        std::max(radius, length({p[0] - sphere_centre[0], p[1] - sphere_centre[1], p[2] - sphere_centre[2]}));
   }
   radius += quantized_mesh_slack_m(mesh, frame);  // decoded vertices lie beside the exact ones
-  const Vec3 centre = ecef_from_geodetic((frame.west_deg + frame.east_deg) / 2, (frame.south_deg + frame.north_deg) / 2,
-                                         (static_cast<double>(q.range[0]) + q.range[1]) / 2);
+  const Vec3 centre =
+      ecef_from_geodetic((frame.west_deg + frame.east_deg) / 2, (frame.south_deg + frame.north_deg) / 2,
+                         (static_cast<double>(q.range[0]) + q.range[1]) / 2);
   out.put(centre);
   out.put(q.range[0]);
   out.put(q.range[1]);
@@ -190,7 +211,9 @@ Result<std::string> encode_quantized_mesh(const TinMesh& mesh, const QuantizedMe
       const TinVertex& p = mesh.vertices[v];
       const double lon = frame.west_deg + (frame.east_deg - frame.west_deg) * p.col / (mesh.cols - 1);
       const double lat = latitude_deg(frame, static_cast<double>(p.row) / (mesh.rows - 1));
-      for (const std::uint8_t b : oct_encoded(ecef_from_enu(lon, lat, {mesh.normals[3 * v], mesh.normals[3 * v + 1], mesh.normals[3 * v + 2]}))) out.put(b);
+      for (const std::uint8_t b : oct_encoded(ecef_from_enu(
+               lon, lat, {mesh.normals[3 * v], mesh.normals[3 * v + 1], mesh.normals[3 * v + 2]})))
+        out.put(b);
     }
   }
   if (options.watermask) {
@@ -207,14 +230,16 @@ Result<std::string> encode_quantized_mesh(const TinMesh& mesh, const QuantizedMe
 
 namespace {
 
-// A triangle that is flat in latitude is bent in Mercator rows: by how many rows at most between rows `top` and `bottom`, with the
-// rounding of move_y mean rows.
+// A triangle that is flat in latitude is bent in Mercator rows: by how many rows at most between rows `top`
+// and `bottom`, with the rounding of move_y mean rows.
 double mercator_rows_off(const Quantizer& q, std::int32_t top, std::int32_t bottom, double move_y) {
   const auto v = [&](double row) {
-    return (latitude_deg(q.frame, row / (q.mesh.rows - 1)) - q.frame.south_deg) / (q.frame.north_deg - q.frame.south_deg) * (q.mesh.rows - 1);
+    return (latitude_deg(q.frame, row / (q.mesh.rows - 1)) - q.frame.south_deg) /
+           (q.frame.north_deg - q.frame.south_deg) * (q.mesh.rows - 1);
   };
   const double bend = std::abs(v((top + bottom) / 2.0) - (v(top) + v(bottom)) / 2);
-  const double thinnest = std::min(v(top) - v(top + 0.5), v(bottom - 0.5) - v(bottom)) * 2;  // mean rows in one row
+  const double thinnest =
+      std::min(v(top) - v(top + 0.5), v(bottom - 0.5) - v(bottom)) * 2;  // mean rows in one row
   return (1.2 * bend + move_y) / thinnest;
 }
 
@@ -223,7 +248,8 @@ double mercator_rows_off(const Quantizer& q, std::int32_t top, std::int32_t bott
 double quantized_mesh_slack_m(const TinMesh& mesh, const GeodeticFrame& frame) {
   if (mesh.top_triangles == 0) return 0;
   const Quantizer q{mesh, frame, height_range(mesh)};
-  // Vertices move by at most these parts of a post; rows of Mercator tiles are compared in latitude, so per post row.
+  // Vertices move by at most these parts of a post; rows of Mercator tiles are compared in latitude, so per
+  // post row.
   double move_x = 0, move_y = 0;
   for (std::size_t v = 0; v < mesh.top_vertices; ++v) {
     const TinVertex& p = mesh.vertices[v];
@@ -232,12 +258,16 @@ double quantized_mesh_slack_m(const TinMesh& mesh, const GeodeticFrame& frame) {
   }
   double steepest = 0;
   for (std::size_t t = 0; t < mesh.top_triangles; ++t) {
-    const TinVertex &a = mesh.vertices[mesh.triangles[3 * t]], &b = mesh.vertices[mesh.triangles[3 * t + 1]], &c = mesh.vertices[mesh.triangles[3 * t + 2]];
+    const TinVertex &a = mesh.vertices[mesh.triangles[3 * t]], &b = mesh.vertices[mesh.triangles[3 * t + 1]],
+                    &c = mesh.vertices[mesh.triangles[3 * t + 2]];
     const double bx = b.col - a.col, by = b.row - a.row, bz = static_cast<double>(b.height_m) - a.height_m;
     const double cx = c.col - a.col, cy = c.row - a.row, cz = static_cast<double>(c.height_m) - a.height_m;
     const double area2 = bx * cy - cx * by;
-    const double rows_off = frame.is_mercator ? mercator_rows_off(q, std::min({a.row, b.row, c.row}), std::max({a.row, b.row, c.row}), move_y) : move_y;
-    steepest = std::max(steepest, std::abs((bz * cy - cz * by) / area2) * move_x + std::abs((bx * cz - cx * bz) / area2) * rows_off);
+    const double rows_off = frame.is_mercator ? mercator_rows_off(q, std::min({a.row, b.row, c.row}),
+                                                                  std::max({a.row, b.row, c.row}), move_y)
+                                              : move_y;
+    steepest = std::max(steepest, std::abs((bz * cy - cz * by) / area2) * move_x +
+                                      std::abs((bx * cz - cx * bz) / area2) * rows_off);
   }
   return (static_cast<double>(q.range[1]) - q.range[0]) / kMax / 2 + steepest;
 }
@@ -279,10 +309,14 @@ class Reader {
 
 }  // namespace
 
-Result<DecodedQuantizedMesh> decode_quantized_mesh(std::span<const std::uint8_t> bytes, std::size_t max_vertices) {
-  const auto corrupt = [](const std::string& what) { return Error{ErrorCode::kCorrupt, "quantized-mesh: " + what}; };
+Result<DecodedQuantizedMesh> decode_quantized_mesh(std::span<const std::uint8_t> bytes,
+                                                   std::size_t max_vertices) {
+  const auto corrupt = [](const std::string& what) {
+    return Error{ErrorCode::kCorrupt, "quantized-mesh: " + what};
+  };
   Reader in(bytes);
-  if (bytes.size() < kHeaderBytes + 4) return corrupt(std::to_string(bytes.size()) + " bytes are too few for a header");
+  if (bytes.size() < kHeaderBytes + 4)
+    return corrupt(std::to_string(bytes.size()) + " bytes are too few for a header");
   DecodedQuantizedMesh mesh;
   mesh.centre = in.vec3();
   mesh.height_min_m = in.get<float>();
@@ -292,8 +326,11 @@ Result<DecodedQuantizedMesh> decode_quantized_mesh(std::span<const std::uint8_t>
   mesh.horizon_occlusion = in.vec3();
 
   const std::size_t count = in.get<std::uint32_t>();
-  if (count > max_vertices) return Error{ErrorCode::kTooLarge, "quantized-mesh: " + std::to_string(count) + " vertices, at most " + std::to_string(max_vertices)};
-  if (count < 3 || 6 * count > in.left()) return corrupt(std::to_string(count) + " vertices in " + std::to_string(bytes.size()) + " bytes");
+  if (count > max_vertices)
+    return Error{ErrorCode::kTooLarge, "quantized-mesh: " + std::to_string(count) + " vertices, at most " +
+                                           std::to_string(max_vertices)};
+  if (count < 3 || 6 * count > in.left())
+    return corrupt(std::to_string(count) + " vertices in " + std::to_string(bytes.size()) + " bytes");
   for (std::vector<std::uint16_t>* values : {&mesh.u, &mesh.v, &mesh.height}) {
     values->reserve(count);
     int value = 0;
@@ -309,19 +346,23 @@ Result<DecodedQuantizedMesh> decode_quantized_mesh(std::span<const std::uint8_t>
   const std::size_t index_bytes = is_wide ? 4 : 2;
   while (is_wide && in.at() % 4 != 0) in.get<std::uint8_t>();
   const std::size_t triangles = in.get<std::uint32_t>();
-  if (triangles > 4 * max_vertices) return Error{ErrorCode::kTooLarge, "quantized-mesh: " + std::to_string(triangles) + " triangles"};
-  if (in.is_short() || triangles == 0 || 3 * triangles > in.left() / index_bytes) return corrupt(std::to_string(triangles) + " triangles do not fit");
+  if (triangles > 4 * max_vertices)
+    return Error{ErrorCode::kTooLarge, "quantized-mesh: " + std::to_string(triangles) + " triangles"};
+  if (in.is_short() || triangles == 0 || 3 * triangles > in.left() / index_bytes)
+    return corrupt(std::to_string(triangles) + " triangles do not fit");
   std::uint32_t highest = 0;
   mesh.indices.reserve(3 * triangles);
   for (std::size_t k = 0; k < 3 * triangles; ++k) {
     const std::uint32_t code = in.index(is_wide);
-    if (code > highest || highest - code >= count) return corrupt("index " + std::to_string(k) + " refers to no vertex");
+    if (code > highest || highest - code >= count)
+      return corrupt("index " + std::to_string(k) + " refers to no vertex");
     mesh.indices.push_back(highest - code);
     if (code == 0) ++highest;
   }
   for (std::vector<std::uint32_t>* side : {&mesh.west, &mesh.south, &mesh.east, &mesh.north}) {
     const std::size_t n = in.get<std::uint32_t>();
-    if (in.is_short() || n > in.left() / index_bytes) return corrupt("an edge list of " + std::to_string(n) + " does not fit");
+    if (in.is_short() || n > in.left() / index_bytes)
+      return corrupt("an edge list of " + std::to_string(n) + " does not fit");
     side->reserve(n);
     for (std::size_t i = 0; i < n; ++i) {
       side->push_back(in.index(is_wide));
@@ -331,10 +372,14 @@ Result<DecodedQuantizedMesh> decode_quantized_mesh(std::span<const std::uint8_t>
   while (in.left() > 0) {
     const auto id = in.get<std::uint8_t>();
     const std::size_t size = in.get<std::uint32_t>();
-    if (in.is_short() || size > in.left()) return corrupt("extension " + std::to_string(id) + " of " + std::to_string(size) + " bytes does not fit");
+    if (in.is_short() || size > in.left())
+      return corrupt("extension " + std::to_string(id) + " of " + std::to_string(size) +
+                     " bytes does not fit");
     const std::span<const std::uint8_t> body = in.take(size);
     if (id == kOctNormals) {
-      if (size != 2 * count) return corrupt("normals for " + std::to_string(size / 2) + " of " + std::to_string(count) + " vertices");
+      if (size != 2 * count)
+        return corrupt("normals for " + std::to_string(size / 2) + " of " + std::to_string(count) +
+                       " vertices");
       mesh.oct_normals.assign(body.begin(), body.end());
     } else if (id == kWatermask) {
       if (size != 1 && size != 65536) return corrupt("a watermask of " + std::to_string(size) + " bytes");

@@ -36,8 +36,14 @@ void BM_DataDependent(benchmark::State& state) { triangulate(state, TinCriterion
 void BM_Delaunay(benchmark::State& state) { triangulate(state, TinCriterion::kDelaunay); }
 
 // Second argument: error bound in metres, or minus a triangle budget.
-BENCHMARK(BM_DataDependent)->ArgNames({"posts", "bound"})->ArgsProduct({{257, 513}, {5, 15, 40, -2000}})->Unit(benchmark::kMillisecond);
-BENCHMARK(BM_Delaunay)->ArgNames({"posts", "bound"})->ArgsProduct({{257, 513}, {5, 15, 40, -2000}})->Unit(benchmark::kMillisecond);
+BENCHMARK(BM_DataDependent)
+    ->ArgNames({"posts", "bound"})
+    ->ArgsProduct({{257, 513}, {5, 15, 40, -2000}})
+    ->Unit(benchmark::kMillisecond);
+BENCHMARK(BM_Delaunay)
+    ->ArgNames({"posts", "bound"})
+    ->ArgsProduct({{257, 513}, {5, 15, 40, -2000}})
+    ->Unit(benchmark::kMillisecond);
 
 }  // namespace
 }  // namespace lodestone

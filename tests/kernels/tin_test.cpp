@@ -33,7 +33,8 @@ TEST(TriangleScan, HasTheSameBitsForEveryInstructionSetAndMatchesAPlainLoop) {
   std::mt19937 random(7);
   for (const Kind kind : {Kind::kFloat, Kind::kInteger, Kind::kPlateau}) {
     std::vector<float> heights = test::heights_of(kind, 0, 0, kSide, kSide, 0, 3);
-    for (int k = 0; k < 200; ++k) heights[random() % heights.size()] = std::numeric_limits<float>::quiet_NaN();
+    for (int k = 0; k < 200; ++k)
+      heights[random() % heights.size()] = std::numeric_limits<float>::quiet_NaN();
     heights.resize(heights.size() + kScanPadding, 0);
     const ScanField field{heights.data(), kSide};
     for (int k = 0; k < 2000; ++k) {
@@ -43,7 +44,8 @@ TEST(TriangleScan, HasTheSameBitsForEveryInstructionSetAndMatchesAPlainLoop) {
         q.height_m = test::sample_m(kind, q.col, q.row, 3);
       }
       const auto cross = [](const ScanPoint& a, const ScanPoint& b, int c, int r) {
-        return static_cast<std::int64_t>(b.row - a.row) * (c - a.col) - static_cast<std::int64_t>(b.col - a.col) * (r - a.row);
+        return static_cast<std::int64_t>(b.row - a.row) * (c - a.col) -
+               static_cast<std::int64_t>(b.col - a.col) * (r - a.row);
       };
       const std::int64_t area = cross(p[0], p[1], p[2].col, p[2].row);
       if (area == 0) continue;
@@ -62,7 +64,8 @@ TEST(TriangleScan, HasTheSameBitsForEveryInstructionSetAndMatchesAPlainLoop) {
           for (std::int64_t& x : w) x = area < 0 ? -x : x;
           const float h = heights[static_cast<std::size_t>(r * kSide + c)];
           if (w[0] < 0 || w[1] < 0 || w[2] < 0 || std::isnan(h)) continue;
-          const double z = (w[0] * p[0].height_m + w[1] * p[1].height_m + w[2] * p[2].height_m) / static_cast<double>(std::abs(area));
+          const double z = (w[0] * p[0].height_m + w[1] * p[1].height_m + w[2] * p[2].height_m) /
+                           static_cast<double>(std::abs(area));
           worst = std::max(worst, std::abs(z - h));
           sum2 += (z - h) * (z - h);
         }
@@ -75,7 +78,8 @@ TEST(TriangleScan, HasTheSameBitsForEveryInstructionSetAndMatchesAPlainLoop) {
 
 TEST(TriangleScan, NamesTheFirstOfEqualErrors) {
   std::vector<float> heights(9 * 9 + kScanPadding, 0);
-  for (const auto& [c, r] : {std::pair{5, 6}, {3, 2}, {7, 2}, {1, 5}}) heights[static_cast<std::size_t>(r * 9 + c)] = 4;
+  for (const auto& [c, r] : {std::pair{5, 6}, {3, 2}, {7, 2}, {1, 5}})
+    heights[static_cast<std::size_t>(r * 9 + c)] = 4;
   const ScanResult result = scan_triangle({heights.data(), 9}, {0, 0, 0}, {0, 8, 0}, {8, 0, 0});
   EXPECT_EQ(result.error_m, 4);
   EXPECT_EQ(result.col, 3);
@@ -90,7 +94,8 @@ TEST(TileBorder, KeepsEndsRequiredPostsAndTheBound) {
   EXPECT_EQ(simplify_edge(flat, required, {}, 0), (std::vector<std::int32_t>{0, 5, 16}));
   const std::vector<float> tent{0, 1, 2, 3, 4, 3, 2, 1, 0};
   EXPECT_EQ(simplify_edge(tent, {}, {}, 0.5), (std::vector<std::int32_t>{0, 4, 8}));
-  EXPECT_EQ(simplify_edge(tent, {}, {}, 4), (std::vector<std::int32_t>{0, 8}));  // an error equal to the bound is allowed
+  EXPECT_EQ(simplify_edge(tent, {}, {}, 4),
+            (std::vector<std::int32_t>{0, 8}));  // an error equal to the bound is allowed
   const std::vector<float> two{0, 3, 0, 0, 0, 3, 0};
   EXPECT_EQ(simplify_edge(two, {}, {}, 2.0), (std::vector<std::int32_t>{0, 1, 2, 5, 6}));
 }
@@ -108,7 +113,8 @@ TEST_P(EveryTerrain, KeepsItsBoundAndIsAProperMesh) {
   EXPECT_LE(worst, bound * (1 + 1e-12) + 1e-9);
   EXPECT_NEAR(mesh.max_error_m, worst, 1e-9 * (1 + worst));
   EXPECT_NEAR(mesh.rms_error_m, rms, 1e-9 * (1 + rms));
-  for (const TinVertex& v : mesh.vertices) EXPECT_EQ(v.height_m, heights[static_cast<std::size_t>(v.row * 97 + v.col)]);
+  for (const TinVertex& v : mesh.vertices)
+    EXPECT_EQ(v.height_m, heights[static_cast<std::size_t>(v.row * 97 + v.col)]);
   if (kind == Kind::kFlat || kind == Kind::kPlane) {
     EXPECT_EQ(mesh.triangle_count(), 2U);
     EXPECT_EQ(mesh.max_error_m, 0);
@@ -120,10 +126,11 @@ TEST_P(EveryTerrain, KeepsItsBoundAndIsAProperMesh) {
   }();
   EXPECT_EQ(mesh.triangle_count(), 2 * mesh.vertex_count() - 2 - border);
 }
-INSTANTIATE_TEST_SUITE_P(Tin, EveryTerrain,
-                         testing::Combine(testing::Values(Kind::kFloat, Kind::kInteger, Kind::kPlateau, Kind::kFlat, Kind::kPlane),
-                                          testing::Values(TinCriterion::kDataDependent, TinCriterion::kDelaunay),
-                                          testing::Values(0.0, 1.0, 7.0, 30.0, 1e9)));
+INSTANTIATE_TEST_SUITE_P(
+    Tin, EveryTerrain,
+    testing::Combine(testing::Values(Kind::kFloat, Kind::kInteger, Kind::kPlateau, Kind::kFlat, Kind::kPlane),
+                     testing::Values(TinCriterion::kDataDependent, TinCriterion::kDelaunay),
+                     testing::Values(0.0, 1.0, 7.0, 30.0, 1e9)));
 
 TEST(Tin, NeighboursHaveIdenticalBorderVertices) {
   constexpr int kPosts = 33;
@@ -140,13 +147,18 @@ TEST(Tin, NeighboursHaveIdenticalBorderVertices) {
       if (is_budget) {
         request.edge_error_m = bounds[pair % 5];
         request.max_error_m.reset();
-        request.max_triangles = static_cast<std::size_t>(50 + (i + 7 * j) % 13);  // budgets differ, borders must not
+        request.max_triangles =
+            static_cast<std::size_t>(50 + (i + 7 * j) % 13);  // budgets differ, borders must not
       }
       return built(request);
     };
     const TinMesh here = mesh_at(i0, j0), east = mesh_at(i0 + 32, j0), south = mesh_at(i0, j0 + 32);
-    EXPECT_EQ(test::side_of(here, border_of(here).east, true), test::side_of(east, border_of(east).west, true)) << pair;
-    EXPECT_EQ(test::side_of(here, border_of(here).south, false), test::side_of(south, border_of(south).north, false)) << pair;
+    EXPECT_EQ(test::side_of(here, border_of(here).east, true),
+              test::side_of(east, border_of(east).west, true))
+        << pair;
+    EXPECT_EQ(test::side_of(here, border_of(here).south, false),
+              test::side_of(south, border_of(south).north, false))
+        << pair;
   }
 }
 
@@ -198,7 +210,9 @@ TEST(Tin, LeavesHolesWhereThereAreVoids) {
   constexpr int kPosts = 33;
   std::vector<float> heights = test::heights_of(Kind::kFloat, 0, 0, kPosts, kPosts, 0, 2);
   std::vector<std::uint8_t> is_void(heights.size(), 0);
-  const auto is_void_post = [](int c, int r) { return (c >= 10 && c <= 14 && r >= 5 && r <= 20) || (r >= 28 && c < 6) || (c == 20 && r == 20); };
+  const auto is_void_post = [](int c, int r) {
+    return (c >= 10 && c <= 14 && r >= 5 && r <= 20) || (r >= 28 && c < 6) || (c == 20 && r == 20);
+  };
   for (int r = 0; r < kPosts; ++r) {
     for (int c = 0; c < kPosts; ++c) {
       if (!is_void_post(c, r)) continue;
@@ -215,7 +229,8 @@ TEST(Tin, LeavesHolesWhereThereAreVoids) {
   for (std::size_t t = 0; t < mesh.top_triangles; ++t) area += test::area2_of(mesh, t);
   for (int r = 0; r + 1 < kPosts; ++r) {
     for (int c = 0; c + 1 < kPosts; ++c) {
-      const bool is_hole = is_void_post(c, r) || is_void_post(c + 1, r) || is_void_post(c, r + 1) || is_void_post(c + 1, r + 1);
+      const bool is_hole = is_void_post(c, r) || is_void_post(c + 1, r) || is_void_post(c, r + 1) ||
+                           is_void_post(c + 1, r + 1);
       expected += is_hole ? 0 : 2;
     }
   }
@@ -234,11 +249,13 @@ TEST(Tin, SkirtsHangOutwardsBelowTheBorderAndLeaveTheTopAlone) {
   EXPECT_TRUE(std::equal(bare.triangles.begin(), bare.triangles.end(), mesh.triangles.begin()));
   EXPECT_EQ(mesh.normals.size(), 3 * mesh.vertex_count());
   const TinBorder border = border_of(mesh);
-  const std::size_t edges = border.west.size() + border.south.size() + border.east.size() + border.north.size() - 4;
+  const std::size_t edges =
+      border.west.size() + border.south.size() + border.east.size() + border.north.size() - 4;
   EXPECT_EQ(mesh.triangle_count() - mesh.top_triangles, 2 * edges);
   EXPECT_EQ(mesh.vertex_count() - mesh.top_vertices, edges);
   for (std::size_t t = mesh.top_triangles; t < mesh.triangle_count(); ++t) {
-    const TinVertex &a = mesh.vertices[mesh.triangles[3 * t]], &b = mesh.vertices[mesh.triangles[3 * t + 1]], &c = mesh.vertices[mesh.triangles[3 * t + 2]];
+    const TinVertex &a = mesh.vertices[mesh.triangles[3 * t]], &b = mesh.vertices[mesh.triangles[3 * t + 1]],
+                    &c = mesh.vertices[mesh.triangles[3 * t + 2]];
     const double bx = b.col - a.col, by = a.row - b.row, bz = b.height_m - a.height_m;
     const double cx = c.col - a.col, cy = a.row - c.row, cz = c.height_m - a.height_m;
     const double east = by * cz - bz * cy, north = bz * cx - bx * cz;
@@ -247,7 +264,8 @@ TEST(Tin, SkirtsHangOutwardsBelowTheBorderAndLeaveTheTopAlone) {
   }
   // The whole is closed but for the lower rim: every top edge has its partner.
   std::set<std::pair<std::uint32_t, std::uint32_t>> directed;
-  for (std::size_t k = 0; k < mesh.triangles.size(); ++k) directed.insert({mesh.triangles[k], mesh.triangles[k % 3 == 2 ? k - 2 : k + 1]});
+  for (std::size_t k = 0; k < mesh.triangles.size(); ++k)
+    directed.insert({mesh.triangles[k], mesh.triangles[k % 3 == 2 ? k - 2 : k + 1]});
   for (const auto& [a, b] : directed) {
     if (a < mesh.top_vertices || b < mesh.top_vertices) {
       EXPECT_TRUE(directed.count({b, a}));
@@ -256,7 +274,8 @@ TEST(Tin, SkirtsHangOutwardsBelowTheBorderAndLeaveTheTopAlone) {
 }
 
 TEST(Tin, NormalsAgreeOnSharedEdgesAndFollowTheSlope) {
-  const std::vector<float> west = test::heights_of(Kind::kFloat, 0, 0, 33, 33, 1, 6), east = test::heights_of(Kind::kFloat, 32, 0, 33, 33, 1, 6);
+  const std::vector<float> west = test::heights_of(Kind::kFloat, 0, 0, 33, 33, 1, 6),
+                           east = test::heights_of(Kind::kFloat, 32, 0, 33, 33, 1, 6);
   const PostField west_field{west, {}, 33, 33, 1}, east_field{east, {}, 33, 33, 1};
   TinMesh a = built(request_for(west, 33, 10, 1)), b = built(request_for(east, 33, 10, 1));
   set_normals(a, west_field, 30, 20);
@@ -264,9 +283,11 @@ TEST(Tin, NormalsAgreeOnSharedEdgesAndFollowTheSlope) {
   const TinBorder at_a = border_of(a), at_b = border_of(b);
   ASSERT_EQ(at_a.east.size(), at_b.west.size());
   for (std::size_t k = 0; k < at_a.east.size(); ++k) {
-    for (std::size_t i = 0; i < 3; ++i) EXPECT_EQ(a.normals[3 * at_a.east[k] + i], b.normals[3 * at_b.west[k] + i]);
+    for (std::size_t i = 0; i < 3; ++i)
+      EXPECT_EQ(a.normals[3 * at_a.east[k] + i], b.normals[3 * at_b.west[k] + i]);
   }
-  const std::vector<float> plane = test::heights_of(Kind::kPlane, 0, 0, 9, 9, 0, 0);  // 3 m up per post east, 2 m up per post north
+  const std::vector<float> plane =
+      test::heights_of(Kind::kPlane, 0, 0, 9, 9, 0, 0);  // 3 m up per post east, 2 m up per post north
   TinMesh p = built(request_for(plane, 9, 0));
   set_normals(p, {plane, {}, 9, 9, 0}, 1, 1);
   EXPECT_FLOAT_EQ(p.normals[0], static_cast<float>(-3 / std::sqrt(14.0)));

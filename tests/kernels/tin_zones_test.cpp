@@ -35,9 +35,11 @@ std::vector<LatticePoint> rc(std::initializer_list<std::pair<int, int>> row_col)
 
 // Zones of a smooth random field, by global cell: an endless map.
 std::uint16_t zone_at(std::int64_t i, std::int64_t j, std::uint64_t seed) {
-  return static_cast<std::uint16_t>(std::clamp(std::floor(test::terrain_m(i, j, seed, 2) / 1.2) + 3, 0.0, 6.0));
+  return static_cast<std::uint16_t>(
+      std::clamp(std::floor(test::terrain_m(i, j, seed, 2) / 1.2) + 3, 0.0, 6.0));
 }
-std::vector<std::uint16_t> zone_cells(std::int64_t i0, std::int64_t j0, int cells, int halo, std::uint64_t seed) {
+std::vector<std::uint16_t> zone_cells(std::int64_t i0, std::int64_t j0, int cells, int halo,
+                                      std::uint64_t seed) {
   std::vector<std::uint16_t> labels;
   for (int r = -halo; r < cells + halo; ++r) {
     for (int c = -halo; c < cells + halo; ++c) labels.push_back(zone_at(i0 + c, j0 + r, seed));
@@ -129,7 +131,8 @@ TEST(ZoneBorder, DroppedVerticesStayNearAndSegmentsStayLegal) {
           if (at + 2 < chains[k].points.size() && p == chains[k].points[at + 1]) ++at;
           const LatticePoint a = chains[k].points[at], b = chains[k].points[at + 1];
           const double dx = b.col - a.col, dy = b.row - a.row;
-          const double s = std::clamp(((p.col - a.col) * dx + (p.row - a.row) * dy) / (dx * dx + dy * dy), 0.0, 1.0);
+          const double s =
+              std::clamp(((p.col - a.col) * dx + (p.row - a.row) * dy) / (dx * dx + dy * dy), 0.0, 1.0);
           ASSERT_LT(std::hypot(p.col - a.col - s * dx, p.row - a.row - s * dy), epsilon);
         }
       }
@@ -184,7 +187,8 @@ TEST_P(ZonedTin, IsAProperMeshWhoseZonesFollowTheMap) {
           is_near = std::hypot(dx, dy) <= reach;
         }
       }
-      ASSERT_TRUE(is_near) << "triangle " << t << " zone " << mesh.zones[t] << " at " << x << "," << y << " seed " << seed;
+      ASSERT_TRUE(is_near) << "triangle " << t << " zone " << mesh.zones[t] << " at " << x << "," << y
+                           << " seed " << seed;
     }
     // Every junction and every place where a border leaves the tile is a vertex.
     std::set<std::pair<int, int>> posts;
@@ -209,8 +213,11 @@ TEST_P(ZonedTin, IsAProperMeshWhoseZonesFollowTheMap) {
   }
 }
 INSTANTIATE_TEST_SUITE_P(Cases, ZonedTin,
-                         testing::Values(ZoneCase{Kind::kFloat, 0, 0, 0}, ZoneCase{Kind::kFloat, 0.75, 0.5, 0}, ZoneCase{Kind::kInteger, 0.75, 0.5, 0},
-                                         ZoneCase{Kind::kPlateau, 2, 0.9, 0}, ZoneCase{Kind::kInteger, 5, 1.5, 0}, ZoneCase{Kind::kFloat, 0, 0, 2},
+                         testing::Values(ZoneCase{Kind::kFloat, 0, 0, 0},
+                                         ZoneCase{Kind::kFloat, 0.75, 0.5, 0},
+                                         ZoneCase{Kind::kInteger, 0.75, 0.5, 0},
+                                         ZoneCase{Kind::kPlateau, 2, 0.9, 0},
+                                         ZoneCase{Kind::kInteger, 5, 1.5, 0}, ZoneCase{Kind::kFloat, 0, 0, 2},
                                          ZoneCase{Kind::kInteger, 0.75, 0.5, 1}));
 
 TEST(ZonedTin, BordersAgreeBetweenNeighbours) {
@@ -220,7 +227,8 @@ TEST(ZonedTin, BordersAgreeBetweenNeighbours) {
     const double bounds[] = {0, 0.5, 3, 10, 60};
     const int transition = pair % 3;
     const auto mesh_at = [&](std::int64_t i, std::int64_t j) {
-      const std::vector<float> heights = test::heights_of(pair % 2 ? Kind::kInteger : Kind::kFloat, i, j, kPosts, kPosts, 0, 5);
+      const std::vector<float> heights =
+          test::heights_of(pair % 2 ? Kind::kInteger : Kind::kFloat, i, j, kPosts, kPosts, 0, 5);
       const std::vector<std::uint16_t> labels = zone_cells(i, j, kPosts - 1, 3 * transition + 3, 5);
       TinRequest request;
       request.field = {heights, {}, kPosts, kPosts, 0};
@@ -234,8 +242,33 @@ TEST(ZonedTin, BordersAgreeBetweenNeighbours) {
       return std::move(*mesh);
     };
     const TinMesh here = mesh_at(i0, j0), east = mesh_at(i0 + 32, j0), south = mesh_at(i0, j0 + 32);
-    EXPECT_EQ(test::side_of(here, border_of(here).east, true), test::side_of(east, border_of(east).west, true)) << pair;
-    EXPECT_EQ(test::side_of(here, border_of(here).south, false), test::side_of(south, border_of(south).north, false)) << pair;
+    EXPECT_EQ(test::side_of(here, border_of(here).east, true),
+              test::side_of(east, border_of(east).west, true))
+        << pair;
+    EXPECT_EQ(test::side_of(here, border_of(here).south, false),
+              test::side_of(south, border_of(south).north, false))
+        << pair;
+  }
+}
+
+TEST(ZonedTin, SurvivesNoiseInTheZoneMap) {
+  constexpr int kPosts = 33;
+  for (std::uint64_t seed = 0; seed < 12; ++seed) {
+    const std::vector<float> heights = test::heights_of(Kind::kInteger, 0, 0, kPosts, kPosts, 0, seed);
+    std::vector<std::uint16_t> labels;
+    for (int k = 0; k < 34 * 34; ++k)
+      labels.push_back(
+          static_cast<std::uint16_t>(test::hash01(k, 0, seed) * static_cast<double>(2 + seed % 5)));
+    for (const double epsilon : {0.0, 0.75, 4.0}) {
+      TinRequest request;
+      request.field = {heights, {}, kPosts, kPosts, 0};
+      request.max_error_m = 20;
+      request.zones = ZoneField{labels, 1, epsilon, 0.9, seed % 2 ? 0 : 1};
+      const Result<TinMesh> mesh = build_tin(request);
+      ASSERT_TRUE(mesh);
+      EXPECT_EQ(test::mesh_fault(*mesh), "") << seed << ' ' << epsilon;
+      EXPECT_LE(mesh->max_error_m, 20);
+    }
   }
 }
 
@@ -277,9 +310,11 @@ TEST(ZonedTin, ZonesEqualAFloodFillOverTheFinishedMesh) {
     request.zones = ZoneField{labels, 1, 2, 1.2};
     const Result<TinMesh> mesh = build_tin(request);
     ASSERT_TRUE(mesh);
-    // Regions joined through edges with one zone on both sides: as many as the 4-connected regions of the map, zone by zone.
+    // Regions joined through edges with one zone on both sides: as many as the 4-connected regions of the
+    // map, zone by zone.
     std::map<std::pair<std::uint32_t, std::uint32_t>, std::size_t> owner;
-    for (std::size_t k = 0; k < mesh->triangles.size(); ++k) owner[{mesh->triangles[k], mesh->triangles[k % 3 == 2 ? k - 2 : k + 1]}] = k / 3;
+    for (std::size_t k = 0; k < mesh->triangles.size(); ++k)
+      owner[{mesh->triangles[k], mesh->triangles[k % 3 == 2 ? k - 2 : k + 1]}] = k / 3;
     const auto count_regions = [](std::size_t n, auto&& neighbours, auto&& zone) {
       std::vector<std::uint8_t> seen(n, 0);
       std::map<int, int> regions;
@@ -300,22 +335,28 @@ TEST(ZonedTin, ZonesEqualAFloodFillOverTheFinishedMesh) {
       }
       return regions;
     };
-    const auto of_mesh = count_regions(mesh->triangle_count(), [&](std::size_t t) {
-      std::vector<std::size_t> n;
-      for (std::size_t i = 0; i < 3; ++i) {
-        const auto it = owner.find({mesh->triangles[3 * t + (i + 1) % 3], mesh->triangles[3 * t + i]});
-        if (it != owner.end()) n.push_back(it->second);
-      }
-      return n;
-    }, [&](std::size_t t) { return static_cast<int>(mesh->zones[t]); });
-    const auto of_map = count_regions(64 * 64, [](std::size_t i) {
-      std::vector<std::size_t> n;
-      if (i % 64 > 0) n.push_back(i - 1);
-      if (i % 64 < 63) n.push_back(i + 1);
-      if (i >= 64) n.push_back(i - 64);
-      if (i + 64 < 64 * 64) n.push_back(i + 64);
-      return n;
-    }, [&](std::size_t i) { return static_cast<int>(labels[(i / 64 + 1) * 66 + i % 64 + 1]); });
+    const auto of_mesh = count_regions(
+        mesh->triangle_count(),
+        [&](std::size_t t) {
+          std::vector<std::size_t> n;
+          for (std::size_t i = 0; i < 3; ++i) {
+            const auto it = owner.find({mesh->triangles[3 * t + (i + 1) % 3], mesh->triangles[3 * t + i]});
+            if (it != owner.end()) n.push_back(it->second);
+          }
+          return n;
+        },
+        [&](std::size_t t) { return static_cast<int>(mesh->zones[t]); });
+    const auto of_map = count_regions(
+        64 * 64,
+        [](std::size_t i) {
+          std::vector<std::size_t> n;
+          if (i % 64 > 0) n.push_back(i - 1);
+          if (i % 64 < 63) n.push_back(i + 1);
+          if (i >= 64) n.push_back(i - 64);
+          if (i + 64 < 64 * 64) n.push_back(i + 64);
+          return n;
+        },
+        [&](std::size_t i) { return static_cast<int>(labels[(i / 64 + 1) * 66 + i % 64 + 1]); });
     EXPECT_EQ(of_mesh, of_map) << seed;
   }
 }

@@ -15,7 +15,9 @@
 namespace lodestone {
 namespace {
 
-std::span<const std::uint8_t> bytes_of(const std::string& s) { return {reinterpret_cast<const std::uint8_t*>(s.data()), s.size()}; }
+std::span<const std::uint8_t> bytes_of(const std::string& s) {
+  return {reinterpret_cast<const std::uint8_t*>(s.data()), s.size()};
+}
 
 struct Sample {
   std::vector<float> heights;
@@ -23,14 +25,17 @@ struct Sample {
 };
 
 // Jacksboro when posts fit into it, with one post of halo.
-Sample sample(int posts, double error_m, bool has_zones, int transition, bool has_skirt, bool has_normals, int seed = 0) {
+Sample sample(int posts, double error_m, bool has_zones, int transition, bool has_skirt, bool has_normals,
+              int seed = 0) {
   Sample s;
   const test::SampleDem dem = test::jacksboro();
   EXPECT_GT(dem.cols, 0) << "python-matplotlib-data is not installed; run config/set-up";
   s.heights = dem.window(10 + 3 * seed, 5 + 2 * seed, posts, 1);
   std::vector<std::uint16_t> labels;
   for (int r = -6; r < posts + 5; ++r) {
-    for (int c = -6; c < posts + 5; ++c) labels.push_back(static_cast<std::uint16_t>(std::fmod(std::abs(test::terrain_m(c, r, 3 + static_cast<unsigned>(seed), 2)) * 2, 4)));
+    for (int c = -6; c < posts + 5; ++c)
+      labels.push_back(static_cast<std::uint16_t>(
+          std::fmod(std::abs(test::terrain_m(c, r, 3 + static_cast<unsigned>(seed), 2)) * 2, 4)));
   }
   TinRequest request;
   request.field = {s.heights, {}, posts, posts, 1};
@@ -100,7 +105,9 @@ TEST(Glb, WritesOnePrimitiveAndMaterialPerZone) {
   for (std::size_t k = 0; k < back->primitives.size(); ++k) {
     const GlbPrimitive& p = back->primitives[k];
     found[p.zone] = p.indices.size() / 3;
-    const auto material = json["materials"][json["meshes"][0]["primitives"][k]["material"].get<std::size_t>()]["name"].get<std::string>();
+    const auto material =
+        json["materials"][json["meshes"][0]["primitives"][k]["material"].get<std::size_t>()]["name"]
+            .get<std::string>();
     if (p.zone == 1) {
       EXPECT_EQ(material, "forest");
     } else if (!is_transition(static_cast<std::uint16_t>(p.zone))) {
@@ -108,7 +115,8 @@ TEST(Glb, WritesOnePrimitiveAndMaterialPerZone) {
     } else {
       has_blend = true;
       ASSERT_EQ(p.blend.size(), p.positions.size() / 3);
-      EXPECT_LT(*std::min_element(p.blend.begin(), p.blend.end()), *std::max_element(p.blend.begin(), p.blend.end()));
+      EXPECT_LT(*std::min_element(p.blend.begin(), p.blend.end()),
+                *std::max_element(p.blend.begin(), p.blend.end()));
     }
   }
   EXPECT_EQ(found, expected);
@@ -122,7 +130,8 @@ TEST(Glb, TexturesOfNeighboursDifferByWholeRepeats) {
   west.texture_size_m = east.texture_size_m = 70;
   west.frame = PlanarFrame{800, 0, 100, 100};
   east.frame = PlanarFrame{1600, 0, 100, 100};
-  const Result<DecodedGlb> a = decode_glb(bytes_of(*encode_glb(mesh, west))), b = decode_glb(bytes_of(*encode_glb(mesh, east)));
+  const Result<DecodedGlb> a = decode_glb(bytes_of(*encode_glb(mesh, west))),
+                           b = decode_glb(bytes_of(*encode_glb(mesh, east)));
   const float at_east = a->primitives[0].uvs[2 * 8], at_west = b->primitives[0].uvs[0];
   EXPECT_NEAR(std::remainder(at_east - at_west, 1.0), 0, 1e-5);
   EXPECT_GE(at_west, 0);
@@ -165,9 +174,9 @@ TEST(Glb, StandsOnTheEllipsoidAsThreeDTilesWants) {
   EXPECT_NEAR(back->translation[1], 0, 1e-6);
   EXPECT_NEAR(back->translation[2], 0, 1e-6);
   const GlbPrimitive& p = back->primitives[0];
-  EXPECT_NEAR(p.normals[3 * 4], 1, 1e-6);             // the middle post looks along ECEF x
-  EXPECT_GT(p.positions[1], 110000);                  // north-west post: north is glTF y
-  EXPECT_GT(p.positions[2], 110000);                  // and west is glTF +z (ECEF -y)
+  EXPECT_NEAR(p.normals[3 * 4], 1, 1e-6);  // the middle post looks along ECEF x
+  EXPECT_GT(p.positions[1], 110000);       // north-west post: north is glTF y
+  EXPECT_GT(p.positions[2], 110000);       // and west is glTF +z (ECEF -y)
   EXPECT_NEAR(ecef_from_geodetic(90, 0, 0)[1], 6378137, 1e-6);
   EXPECT_NEAR(ecef_from_geodetic(0, 90, 0)[2], 6356752.314245, 1e-5);
 }
@@ -181,7 +190,8 @@ TEST(Glb, UsesWideIndicesOnlyWhereItMust) {
   EXPECT_EQ(back->primitives[0].indices, mesh.triangles);
   EXPECT_NE(back->json.find("\"componentType\":5125"), std::string::npos);
   const TinMesh small = *build_grid_mesh({heights, {}, 257, 257, 0}, 0, 0, 2);
-  EXPECT_EQ(decode_glb(bytes_of(*encode_glb(small, GlbOptions{})))->json.find("\"componentType\":5125"), std::string::npos);
+  EXPECT_EQ(decode_glb(bytes_of(*encode_glb(small, GlbOptions{})))->json.find("\"componentType\":5125"),
+            std::string::npos);
 }
 
 TEST(Glb, RefusesMeshesAndOptionsThatItCannotWrite) {
@@ -224,7 +234,8 @@ TEST(Glb, DecoderSurvivesEveryPrefixAndManyWrongBytes) {
   EXPECT_FALSE(decode_glb(bytes_of(glb), 64)) << "the limit holds";
 }
 
-// Files for the clients in tests/clients: every option set, several windows. Always checked to decode; kept when a folder is given.
+// Files for the clients in tests/clients: every option set, several windows. Always checked to decode; kept
+// when a folder is given.
 TEST(Glb, EveryOptionSetDecodes) {
   const char* folder = std::getenv("LODESTONE_GLB_OUT");
   const double bounds[] = {2, 8, 20, 60};
@@ -233,7 +244,8 @@ TEST(Glb, EveryOptionSetDecodes) {
     for (int set = 0; set < 24; ++set) {
       const bool has_zones = set & 1, has_skirt = set & 2, has_normals = set & 4;
       const int shape = set / 8;  // floats on a plane, quantised, ellipsoid
-      const Sample s = sample(65 + 64 * (seed % 2), bounds[seed], has_zones, has_zones ? seed % 3 : 0, has_skirt, has_normals, seed * 24 + set);
+      const Sample s = sample(65 + 64 * (seed % 2), bounds[seed], has_zones, has_zones ? seed % 3 : 0,
+                              has_skirt, has_normals, seed * 24 + set);
       GlbOptions options;
       if (shape < 2) options.frame = PlanarFrame{1000.5 * seed, 77.25 * set, 75, 92};
       if (shape == 2) options.frame = GeodeticFrame{-84.4, 36.6, -84.3, 36.7, (set & 1) != 0};
@@ -244,7 +256,9 @@ TEST(Glb, EveryOptionSetDecodes) {
       ASSERT_TRUE(decode_glb(bytes_of(*glb)));
       ++files;
       if (folder == nullptr) continue;
-      std::ofstream(std::string(folder) + "/" + std::to_string(seed) + "_" + std::to_string(set) + ".glb", std::ios::binary) << *glb;
+      std::ofstream(std::string(folder) + "/" + std::to_string(seed) + "_" + std::to_string(set) + ".glb",
+                    std::ios::binary)
+          << *glb;
     }
   }
   EXPECT_EQ(files, 96);

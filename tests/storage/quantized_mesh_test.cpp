@@ -15,7 +15,9 @@
 namespace lodestone {
 namespace {
 
-std::span<const std::uint8_t> bytes_of(const std::string& s) { return {reinterpret_cast<const std::uint8_t*>(s.data()), s.size()}; }
+std::span<const std::uint8_t> bytes_of(const std::string& s) {
+  return {reinterpret_cast<const std::uint8_t*>(s.data()), s.size()};
+}
 
 TinMesh meshed(const std::vector<float>& heights, int posts, double error_m, int halo) {
   TinRequest request;
@@ -39,7 +41,8 @@ TEST(QuantizedMesh, GivesBackTheMeshWithinItsStatedSlack) {
   const std::vector<float> heights = jacksboro_window(257);
   for (const double bound : {5.0, 20.0}) {
     const TinMesh mesh = meshed(heights, 257, bound, 1);
-    const Result<std::string> bytes = encode_quantized_mesh(mesh, {kFrame, true, std::nullopt, R"({"error":5})"});
+    const Result<std::string> bytes =
+        encode_quantized_mesh(mesh, {kFrame, true, std::nullopt, R"({"error":5})"});
     ASSERT_TRUE(bytes) << bytes.error().message;
     const Result<DecodedQuantizedMesh> back = decode_quantized_mesh(bytes_of(*bytes));
     ASSERT_TRUE(back) << back.error().message;
@@ -59,17 +62,21 @@ TEST(QuantizedMesh, GivesBackTheMeshWithinItsStatedSlack) {
     // The decoded surface, sampled at the posts by barycentric coordinates in u, v.
     double worst = 0;
     for (std::size_t t = 0; t < back->indices.size() / 3; ++t) {
-      const std::uint32_t a = back->indices[3 * t], b = back->indices[3 * t + 1], c = back->indices[3 * t + 2];
+      const std::uint32_t a = back->indices[3 * t], b = back->indices[3 * t + 1],
+                          c = back->indices[3 * t + 2];
       const auto x = [&](std::uint32_t i) { return back->u[i] * 256 / 32767.0; };
       const auto y = [&](std::uint32_t i) { return 256 - back->v[i] * 256 / 32767.0; };
       const double area = (x(b) - x(a)) * (y(c) - y(a)) - (x(c) - x(a)) * (y(b) - y(a));
       ASSERT_LT(area, 0) << "counter-clockwise with v up";
-      for (int r = static_cast<int>(std::ceil(std::min({y(a), y(b), y(c)}) - 0.01)); r <= std::max({y(a), y(b), y(c)}) + 0.01; ++r) {
-        for (int col = static_cast<int>(std::ceil(std::min({x(a), x(b), x(c)}) - 0.01)); col <= std::max({x(a), x(b), x(c)}) + 0.01; ++col) {
+      for (int r = static_cast<int>(std::ceil(std::min({y(a), y(b), y(c)}) - 0.01));
+           r <= std::max({y(a), y(b), y(c)}) + 0.01; ++r) {
+        for (int col = static_cast<int>(std::ceil(std::min({x(a), x(b), x(c)}) - 0.01));
+             col <= std::max({x(a), x(b), x(c)}) + 0.01; ++col) {
           const double wb = ((col - x(a)) * (y(c) - y(a)) - (x(c) - x(a)) * (r - y(a))) / area;
           const double wc = ((x(b) - x(a)) * (r - y(a)) - (col - x(a)) * (y(b) - y(a))) / area;
           if (wb < 0 || wc < 0 || wb + wc > 1) continue;
-          const double z = (1 - wb - wc) * back->height_m(a) + wb * back->height_m(b) + wc * back->height_m(c);
+          const double z =
+              (1 - wb - wc) * back->height_m(a) + wb * back->height_m(b) + wc * back->height_m(c);
           worst = std::max(worst, std::abs(z - heights[static_cast<std::size_t>((r + 1) * 259 + col + 1)]));
         }
       }
@@ -81,9 +88,12 @@ TEST(QuantizedMesh, GivesBackTheMeshWithinItsStatedSlack) {
 
 TEST(QuantizedMesh, EdgeListsAreExactlyTheVerticesOfEachSide) {
   const TinMesh mesh = meshed(jacksboro_window(129), 129, 10, 1);
-  const Result<DecodedQuantizedMesh> back = decode_quantized_mesh(bytes_of(*encode_quantized_mesh(mesh, {kFrame, false, std::nullopt, ""})));
+  const Result<DecodedQuantizedMesh> back =
+      decode_quantized_mesh(bytes_of(*encode_quantized_mesh(mesh, {kFrame, false, std::nullopt, ""})));
   ASSERT_TRUE(back);
-  const auto expect_side = [&](const std::vector<std::uint32_t>& side, const std::vector<std::uint16_t>& across, int at, const std::vector<std::uint16_t>& along) {
+  const auto expect_side = [&](const std::vector<std::uint32_t>& side,
+                               const std::vector<std::uint16_t>& across, int at,
+                               const std::vector<std::uint16_t>& along) {
     std::size_t count = 0;
     for (const std::uint16_t x : across) count += x == at;
     EXPECT_EQ(side.size(), count);
@@ -102,9 +112,12 @@ TEST(QuantizedMesh, EdgeListsAreExactlyTheVerticesOfEachSide) {
 
 TEST(QuantizedMesh, NeighboursMeetAtTheSamePlaces) {
   const test::SampleDem dem = test::jacksboro();
-  const TinMesh west = meshed(dem.window(10, 10, 129, 1), 129, 8, 1), east = meshed(dem.window(138, 10, 129, 1), 129, 8, 1);
-  const Result<DecodedQuantizedMesh> a = decode_quantized_mesh(bytes_of(*encode_quantized_mesh(west, {kFrame, true, std::nullopt, ""})));
-  const Result<DecodedQuantizedMesh> b = decode_quantized_mesh(bytes_of(*encode_quantized_mesh(east, {kFrame, true, std::nullopt, ""})));
+  const TinMesh west = meshed(dem.window(10, 10, 129, 1), 129, 8, 1),
+                east = meshed(dem.window(138, 10, 129, 1), 129, 8, 1);
+  const Result<DecodedQuantizedMesh> a =
+      decode_quantized_mesh(bytes_of(*encode_quantized_mesh(west, {kFrame, true, std::nullopt, ""})));
+  const Result<DecodedQuantizedMesh> b =
+      decode_quantized_mesh(bytes_of(*encode_quantized_mesh(east, {kFrame, true, std::nullopt, ""})));
   ASSERT_EQ(a->east.size(), b->west.size());
   const double step = (a->height_max_m - a->height_min_m + b->height_max_m - b->height_min_m) / 32767.0;
   for (std::size_t k = 0; k < a->east.size(); ++k) {
@@ -116,12 +129,17 @@ TEST(QuantizedMesh, NeighboursMeetAtTheSamePlaces) {
 TEST(QuantizedMesh, HeaderEnclosesTheMeshAndItsOcclusionPointIsSafe) {
   const std::vector<float> heights = jacksboro_window(129);
   const TinMesh mesh = meshed(heights, 129, 10, 1);
-  for (const GeodeticFrame& frame : {kFrame, GeodeticFrame{-180, -90, 0, 90, false}, GeodeticFrame{-90, -45, 0, 45, false}, GeodeticFrame{10, 40, 55, 60, true}}) {
-    const Result<DecodedQuantizedMesh> back = decode_quantized_mesh(bytes_of(*encode_quantized_mesh(mesh, {frame, false, std::nullopt, ""})));
+  for (const GeodeticFrame& frame :
+       {kFrame, GeodeticFrame{-180, -90, 0, 90, false}, GeodeticFrame{-90, -45, 0, 45, false},
+        GeodeticFrame{10, 40, 55, 60, true}}) {
+    const Result<DecodedQuantizedMesh> back =
+        decode_quantized_mesh(bytes_of(*encode_quantized_mesh(mesh, {frame, false, std::nullopt, ""})));
     ASSERT_TRUE(back);
     const std::vector<Vec3> positions = ecef_positions(mesh, frame);
     for (const Vec3& p : positions) {
-      EXPECT_LE(std::hypot(p[0] - back->sphere_centre[0], p[1] - back->sphere_centre[1], p[2] - back->sphere_centre[2]), back->sphere_radius);
+      EXPECT_LE(std::hypot(p[0] - back->sphere_centre[0], p[1] - back->sphere_centre[1],
+                           p[2] - back->sphere_centre[2]),
+                back->sphere_radius);
     }
     for (const double x : back->horizon_occlusion) ASSERT_TRUE(std::isfinite(x));
     if (frame.east_deg - frame.west_deg > 90) continue;  // no point stands for half the Earth
@@ -143,7 +161,8 @@ TEST(QuantizedMesh, HeaderEnclosesTheMeshAndItsOcclusionPointIsSafe) {
       for (double& e : eye) e *= scale;
       if (!is_hidden(eye, back->horizon_occlusion)) continue;
       ++hidden;
-      for (const Vec3& p : positions) ASSERT_TRUE(is_hidden(eye, {p[0] / kX * 0.999999, p[1] / kX * 0.999999, p[2] / kZ * 0.999999}));
+      for (const Vec3& p : positions)
+        ASSERT_TRUE(is_hidden(eye, {p[0] / kX * 0.999999, p[1] / kX * 0.999999, p[2] / kZ * 0.999999}));
     }
     EXPECT_GT(hidden, 200);
   }
@@ -167,7 +186,8 @@ TEST(QuantizedMesh, CarriesAWatermask) {
   const TinMesh mesh = meshed(jacksboro_window(33), 33, 10, 1);
   std::vector<std::uint8_t> mask(65536);
   for (std::size_t i = 0; i < mask.size(); ++i) mask[i] = static_cast<std::uint8_t>(i % 251);
-  const Result<std::string> bytes = encode_quantized_mesh(mesh, {kFrame, true, std::span<const std::uint8_t>(mask), "{}"});
+  const Result<std::string> bytes =
+      encode_quantized_mesh(mesh, {kFrame, true, std::span<const std::uint8_t>(mask), "{}"});
   ASSERT_TRUE(bytes);
   EXPECT_EQ(decode_quantized_mesh(bytes_of(*bytes))->watermask, mask);
   const std::vector<std::uint8_t> wrong(3);
@@ -188,7 +208,8 @@ TEST(QuantizedMesh, LeavesSkirtsToTheClient) {
 TEST(QuantizedMesh, WritesWideIndicesForLargeMeshes) {
   const std::vector<float> heights = test::heights_of(test::Kind::kFloat, 0, 0, 257, 257, 0, 1);
   const TinMesh mesh = *build_grid_mesh({heights, {}, 257, 257, 0}, 0, 0, 1);
-  const Result<DecodedQuantizedMesh> back = decode_quantized_mesh(bytes_of(*encode_quantized_mesh(mesh, {kFrame, false, std::nullopt, ""})));
+  const Result<DecodedQuantizedMesh> back =
+      decode_quantized_mesh(bytes_of(*encode_quantized_mesh(mesh, {kFrame, false, std::nullopt, ""})));
   ASSERT_TRUE(back) << back.error().message;
   EXPECT_EQ(back->u.size(), 66049U);
   EXPECT_EQ(back->indices.size(), mesh.triangles.size());
@@ -198,7 +219,8 @@ TEST(QuantizedMesh, WritesWideIndicesForLargeMeshes) {
 TEST(QuantizedMesh, DecoderSurvivesEveryPrefixAndManyWrongBytes) {
   const TinMesh mesh = meshed(jacksboro_window(17), 17, 10, 1);
   const std::vector<std::uint8_t> water{255};
-  const std::string bytes = *encode_quantized_mesh(mesh, {kFrame, true, std::span<const std::uint8_t>(water), R"({"a":1})"});
+  const std::string bytes =
+      *encode_quantized_mesh(mesh, {kFrame, true, std::span<const std::uint8_t>(water), R"({"a":1})"});
   const Result<DecodedQuantizedMesh> whole = decode_quantized_mesh(bytes_of(bytes));
   ASSERT_TRUE(whole);
   int complete = 0;
@@ -244,7 +266,8 @@ TEST(QuantizedMesh, EveryExtensionSetDecodes) {
     // What our own reader sees, for other readers to agree with.
     std::ofstream plain(stem + ".txt");
     plain << back->u.size() << ' ' << back->indices.size() / 3 << '\n';
-    for (std::size_t i = 0; i < back->u.size(); ++i) plain << back->u[i] << ' ' << back->v[i] << ' ' << back->height[i] << '\n';
+    for (std::size_t i = 0; i < back->u.size(); ++i)
+      plain << back->u[i] << ' ' << back->v[i] << ' ' << back->height[i] << '\n';
     for (const std::uint32_t i : back->indices) plain << i << '\n';
     for (const auto* side : {&back->west, &back->south, &back->east, &back->north}) {
       plain << side->size();

@@ -1,5 +1,6 @@
 #pragma once
-// The sample DEM of Debian's python-matplotlib-data: 344 rows of 403 int16 metres, in a stored zip of .npy files.
+// The sample DEM of Debian's python-matplotlib-data: 344 rows of 403 int16 metres, in a stored zip of .npy
+// files.
 
 #include <cpl_vsi.h>
 
@@ -29,7 +30,8 @@ struct SampleDem {
 // Empty (cols 0) when the package is missing.
 inline SampleDem jacksboro() {
   SampleDem dem;
-  VSILFILE* file = VSIFOpenL("/vsizip/{/usr/share/matplotlib/mpl-data/sample_data/jacksboro_fault_dem.npz}/elevation.npy", "rb");
+  VSILFILE* file = VSIFOpenL(
+      "/vsizip/{/usr/share/matplotlib/mpl-data/sample_data/jacksboro_fault_dem.npz}/elevation.npy", "rb");
   if (file == nullptr) return dem;
   constexpr int kCols = 403, kRows = 344, kHeaderBytes = 80;
   std::vector<std::int16_t> values(kCols * kRows);

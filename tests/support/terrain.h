@@ -1,5 +1,6 @@
 #pragma once
-// Generated terrain for tests: endless, addressed by global post, so that neighbouring tiles share their edge posts.
+// Generated terrain for tests: endless, addressed by global post, so that neighbouring tiles share their edge
+// posts.
 
 #include <cmath>
 #include <cstdint>
@@ -35,16 +36,22 @@ enum class Kind { kFloat, kInteger, kPlateau, kFlat, kPlane };
 inline float sample_m(Kind kind, std::int64_t i, std::int64_t j, std::uint64_t seed) {
   const double h = terrain_m(i, j, seed);
   switch (kind) {
-    case Kind::kFloat: return static_cast<float>(h);
-    case Kind::kInteger: return static_cast<float>(std::floor(h + 0.5));
-    case Kind::kPlateau: return static_cast<float>(std::floor(h / 60) * 60);
-    case Kind::kPlane: return static_cast<float>(3 * i - 2 * j);
-    default: return 100;
+    case Kind::kFloat:
+      return static_cast<float>(h);
+    case Kind::kInteger:
+      return static_cast<float>(std::floor(h + 0.5));
+    case Kind::kPlateau:
+      return static_cast<float>(std::floor(h / 60) * 60);
+    case Kind::kPlane:
+      return static_cast<float>(3 * i - 2 * j);
+    default:
+      return 100;
   }
 }
 
 // (cols + 2 halo) * (rows + 2 halo) heights around the window whose north-west post is (i0, j0).
-inline std::vector<float> heights_of(Kind kind, std::int64_t i0, std::int64_t j0, int cols, int rows, int halo, std::uint64_t seed) {
+inline std::vector<float> heights_of(Kind kind, std::int64_t i0, std::int64_t j0, int cols, int rows,
+                                     int halo, std::uint64_t seed) {
   std::vector<float> heights;
   for (int r = -halo; r < rows + halo; ++r) {
     for (int c = -halo; c < cols + halo; ++c) heights.push_back(sample_m(kind, i0 + c, j0 + r, seed));
