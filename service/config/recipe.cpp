@@ -5,6 +5,8 @@
 #include <charconv>
 #include <cmath>
 
+#include "kernels/fractal/node_roughness.h"
+
 namespace lodestone {
 namespace {
 
@@ -133,7 +135,7 @@ Result<void> set_recipe_parameter(Recipe& recipe, const std::string& name, const
     return {};
   }
   if (name == "depth_limit") return put_whole(recipe.depth_limit, 0, kMaxDepth);
-  if (name == "node") return put_whole(recipe.node, 1, 8);
+  if (name == "node") return put_whole(recipe.node, 2, kMaxNodeLog2);
   if (name == "volume") return pick(recipe.is_volume_published, {"triangle", "published"}, [](int n) { return n == 1; });
   if (name == "erosion") return pick(recipe.has_erosion, {"false", "true"}, [](int n) { return n == 1; });
   if (name == "water") return put_number(recipe.water_m, -12000, 9000);

@@ -33,28 +33,55 @@ Result<std::optional<MaskCrop>> void_crop(const Layer& layer, const PostWindow& 
   return std::optional<MaskCrop>(std::move(crop));
 }
 
+// Data posts around the cells of an area `depth` levels below base.
+PostWindow coarse_cells(const GroundArea& area, int depth) {
+  return {floor_shift(area.x0, depth), floor_shift(area.y0, depth), ceil_shift(area.x0 + area.posts - 1, depth),
+          ceil_shift(area.y0 + area.posts - 1, depth)};
+}
+
 // Provenance of a synthetic tile: kSynthetic, or kFilled where a data vertex with non-zero bilinear weight is void.
-std::vector<std::uint8_t> synthetic_provenance(const WaveletTask& task, const std::vector<std::uint8_t>& coarse_void) {
-  std::vector<std::uint8_t> out(static_cast<std::size_t>(task.posts) * task.posts, kSynthetic);
+// coarse_void: of the posts `coarse`, empty when none is void.
+std::vector<std::uint8_t> synthetic_provenance(const GroundArea& area, int depth, const PostWindow& coarse,
+                                               const std::vector<std::uint8_t>& coarse_void) {
+  std::vector<std::uint8_t> out(static_cast<std::size_t>(area.posts) * area.posts, kSynthetic);
   if (coarse_void.empty()) return out;
-  const PostWindow coarse = coarse_window(task);
   const auto is_void = [&](std::int64_t i, std::int64_t j) {
     return coarse_void[static_cast<std::size_t>((j - coarse.j0) * coarse.width() + i - coarse.i0)] != 0;
   };
-  for (int row = 0; row < task.posts; ++row) {
-    const std::int64_t y = task.y0 + row;
-    for (int column = 0; column < task.posts; ++column) {
-      const std::int64_t x = task.x0 + column;
-      const std::int64_t i0 = floor_shift(x, task.depth);
-      const std::int64_t i1 = ceil_shift(x, task.depth);
-      const std::int64_t j0 = floor_shift(y, task.depth);
-      const std::int64_t j1 = ceil_shift(y, task.depth);
+  for (int row = 0; row < area.posts; ++row) {
+    const std::int64_t j0 = floor_shift(area.y0 + row, depth);
+    const std::int64_t j1 = ceil_shift(area.y0 + row, depth);
+    for (int column = 0; column < area.posts; ++column) {
+      const std::int64_t i0 = floor_shift(area.x0 + column, depth);
+      const std::int64_t i1 = ceil_shift(area.x0 + column, depth);
       if (is_void(i0, j0) || is_void(i1, j0) || is_void(i0, j1) || is_void(i1, j1)) {
-        out[static_cast<std::size_t>(row) * task.posts + column] = kFilled;
+        out[static_cast<std::size_t>(row) * area.posts + column] = kFilled;
       }
     }
   }
   return out;
+}
+
+// The masks of a task: voids around it, and the layer's masks that the recipe names.
+template <class Task>
+Result<void> set_masks(const Layer& layer, const Recipe& recipe, Task& task) {
+  task.mask_mode = recipe.mask_mode;
+  auto voids = void_crop(layer, mask_window(task, 0));
+  if (!voids) return voids.error();
+  task.void_mask = std::move(*voids);
+  const std::vector<std::string> masks = layer.resolve_masks(recipe.masks);
+  if (masks.empty()) return {};
+  auto level = layer.masks().finest_level(masks);
+  if (!level) return level.error();
+  auto crop = layer.masks().crop(masks, *level, mask_window(task, *level));
+  if (!crop) return crop.error();
+  task.mask = std::move(*crop);
+  return {};
+}
+
+GroundArea area_of(const GroundRequest& request) {
+  const std::int64_t cells = request.layer->info().cells_per_tile();
+  return {request.id.z, request.id.x * cells, request.id.y * cells, static_cast<int>(cells) + 1};
 }
 
 }  // namespace
@@ -88,7 +115,6 @@ Result<PreparedTask> prepare_task(const Layer& layer, const Recipe& recipe, std:
   task.seed = seed;
   task.basis = recipe.basis;
   task.lookup = recipe.lookup;
-  task.mask_mode = recipe.mask_mode;
   task.method = recipe.method == Method::kGsa   ? WaveletMethod::kGsa
                 : recipe.method == Method::kLsa ? WaveletMethod::kLsa
                                                 : WaveletMethod::kLinear;
@@ -115,25 +141,66 @@ Result<PreparedTask> prepare_task(const Layer& layer, const Recipe& recipe, std:
     if (!maps) return maps.error();
     task.maps = std::move(*maps);
   }
-  auto voids = void_crop(layer, mask_window(task, 0));
-  if (!voids) return voids.error();
-  task.void_mask = std::move(*voids);
-  const std::vector<std::string> masks = layer.resolve_masks(recipe.masks);
-  if (!masks.empty()) {
-    auto level = layer.masks().finest_level(masks);
-    if (!level) return level.error();
-    auto crop = layer.masks().crop(masks, *level, mask_window(task, *level));
-    if (!crop) return crop.error();
-    task.mask = std::move(*crop);
+  if (auto ok = set_masks(layer, recipe, task); !ok) return ok.error();
+  return prepared;
+}
+
+bool is_fractal(const Recipe& recipe, const LayerInfo& info) {
+  return recipe.method >= Method::kSquareSquare && info.world.width() >= 2 && info.world.height() >= 2;
+}
+
+Result<PreparedFractalTask> prepare_fractal_task(const Layer& layer, const Recipe& recipe, std::uint64_t seed, const GroundArea& area) {
+  const LayerInfo& info = layer.info();
+  PreparedFractalTask prepared;
+  FractalTask& task = prepared.task;
+  task.world = info.world;
+  task.base_level = info.base_level;
+  task.depth = area.z - info.base_level;
+  task.x0 = area.x0;
+  task.y0 = area.y0;
+  task.posts = area.posts;
+  task.seed = seed;
+  task.method = recipe.method == Method::kSquareSquare    ? FractalMethod::kSquareSquare
+                : recipe.method == Method::kDiamondSquare ? FractalMethod::kDiamondSquare
+                                                          : FractalMethod::kFractalWavelet;
+  FractalParameters& p = task.parameters;
+  p.lookup = recipe.lookup == SigmaLookup::kSmooth ? NodeLookup::kSmooth : NodeLookup::kConstant;
+  p.volume = recipe.is_volume_published ? VolumeRule::kPublished : VolumeRule::kTriangle;
+  p.erosion = recipe.has_erosion;
+  if (recipe.water_m) p.water_m = static_cast<float>(*recipe.water_m);
+  if (recipe.cap_m) p.cap_m = static_cast<float>(*recipe.cap_m);
+  if (recipe.altitude.size() == 4) {
+    p.altitude = AltitudeRule{static_cast<float>(recipe.altitude[0]), static_cast<float>(recipe.altitude[1]),
+                              static_cast<float>(recipe.altitude[2]), static_cast<float>(recipe.altitude[3])};
+  }
+  auto coarse = layer.store().read_window(info.base_level, coarse_window(task));
+  if (!coarse) return coarse.error();
+  task.coarse_m = std::move(coarse->heights_m);
+  const PostWindow nodes = node_window(task, recipe.node);
+  auto heights = layer.store().read_window(info.base_level, node_heights_window(nodes, info.world, recipe.node));
+  if (!heights) return heights.error();
+  task.nodes = estimate_nodes(*heights, info.world, nodes, recipe.node);
+  if (auto ok = set_masks(layer, recipe, task); !ok) return ok.error();
+  const PostWindow cells = coarse_cells(area, task.depth);
+  auto any = layer.store().has_voids(cells);
+  if (!any) return any.error();
+  if (*any) {
+    auto around = layer.store().read_window(info.base_level, cells);
+    if (!around) return around.error();
+    prepared.coarse_void = std::move(around->is_void);
   }
   return prepared;
 }
 
 Result<std::unique_ptr<GroundMaker>> GroundMaker::create(std::shared_ptr<Device> device) {
-  if (!device) return std::unique_ptr<GroundMaker>(new GroundMaker(make_host_wavelet_synthesis()));
-  auto wavelet = make_device_wavelet_synthesis(std::move(device));
+  if (!device) {
+    return std::unique_ptr<GroundMaker>(new GroundMaker(make_host_wavelet_synthesis(), make_host_fractal_synthesis()));
+  }
+  auto wavelet = make_device_wavelet_synthesis(device);
   if (!wavelet) return wavelet.error();
-  return std::unique_ptr<GroundMaker>(new GroundMaker(std::move(*wavelet)));
+  auto fractal = make_device_fractal_synthesis(std::move(device));
+  if (!fractal) return fractal.error();
+  return std::unique_ptr<GroundMaker>(new GroundMaker(std::move(*wavelet), std::move(*fractal)));
 }
 
 Result<void> GroundMaker::probe(const WaveletTask& task) {
@@ -156,27 +223,32 @@ Result<Ground> GroundMaker::make_real(const GroundRequest& request) {
   return ground;
 }
 
-void GroundMaker::make_wavelet(std::span<const GroundRequest> requests, std::span<const std::size_t> which,
-                               std::vector<Result<Ground>>& grounds) {
-  std::vector<WaveletTask> tasks;
-  std::vector<std::vector<std::uint8_t>> coarse_voids;
+namespace {
+
+// Prepares the requests `which`, runs them as one batch and gives heights and provenance back; failures go to `grounds`.
+template <class Prepared, class Prepare, class Synthesis>
+void run_batch(std::span<const GroundRequest> requests, std::span<const std::size_t> which, Prepare prepare, Synthesis& synthesis,
+               std::vector<Result<Ground>>& grounds) {
+  std::vector<decltype(Prepared::task)> tasks;
+  std::vector<std::vector<std::uint8_t>> provenances;
   std::vector<std::size_t> sources;
   for (const std::size_t n : which) {
     const GroundRequest& request = requests[n];
-    const std::int64_t cells = request.layer->info().cells_per_tile();
-    auto prepared = prepare_task(*request.layer, request.recipe, request.seed,
-                                 {request.id.z, request.id.x * cells, request.id.y * cells, static_cast<int>(cells) + 1});
+    const GroundArea area = area_of(request);
+    Result<Prepared> prepared = prepare(*request.layer, request.recipe, request.seed, area);
     if (!prepared) {
-      grounds[n] = std::move(prepared.error()).within("preparing tile " + to_string(requests[n].id));
+      grounds[n] = std::move(prepared.error()).within("preparing tile " + to_string(request.id));
       continue;
     }
+    PostWindow coarse = coarse_cells(area, prepared->task.depth);
+    if constexpr (std::is_same_v<Prepared, PreparedTask>) coarse = coarse_window(prepared->task);
+    provenances.push_back(synthetic_provenance(area, prepared->task.depth, coarse, prepared->coarse_void));
     tasks.push_back(std::move(prepared->task));
-    coarse_voids.push_back(std::move(prepared->coarse_void));
     sources.push_back(n);
   }
   if (tasks.empty()) return;
   std::vector<std::vector<float>> heights(tasks.size());
-  if (auto ok = wavelet_->run(tasks, heights); !ok) {
+  if (auto ok = synthesis.run(tasks, heights); !ok) {
     for (const std::size_t n : sources) grounds[n] = ok.error();
     return;
   }
@@ -186,16 +258,19 @@ void GroundMaker::make_wavelet(std::span<const GroundRequest> requests, std::spa
     Ground ground;
     ground.posts = info.posts_per_tile;
     ground.heights_m = std::move(heights[t]);
-    ground.provenance = synthetic_provenance(tasks[t], coarse_voids[t]);
+    ground.provenance = std::move(provenances[t]);
     extend_beyond_data(info.tile_window(request.id), info.world_at(request.id.z), ground);
     count_provenance(ground);
     grounds[sources[t]] = std::move(ground);
   }
 }
 
+}  // namespace
+
 std::vector<Result<Ground>> GroundMaker::make(std::span<const GroundRequest> requests) {
   std::vector<Result<Ground>> grounds(requests.size(), Result<Ground>(Error{ErrorCode::kInternal, "tile was not made"}));
   std::vector<std::size_t> wavelet;
+  std::vector<std::size_t> fractal;
   for (std::size_t n = 0; n < requests.size(); ++n) {
     const GroundRequest& request = requests[n];
     const LayerInfo& info = request.layer->info();
@@ -203,16 +278,18 @@ std::vector<Result<Ground>> GroundMaker::make(std::span<const GroundRequest> req
       grounds[n] = Error{ErrorCode::kNotFound, fmt::format("tile {} is outside layer {}", to_string(request.id), info.name)};
     } else if (request.id.z <= info.base_level) {
       grounds[n] = make_real(request);
-    } else if (request.recipe.method <= Method::kLsa) {
-      wavelet.push_back(n);
+    } else if (is_fractal(request.recipe, info)) {
+      fractal.push_back(n);
     } else {
-      grounds[n] = Error{ErrorCode::kUnsupported, fmt::format("method {} is not available in this build", to_string(request.recipe.method))};
+      wavelet.push_back(n);
     }
   }
   // Equal depths next to each other, so that they share launches.
-  std::stable_sort(wavelet.begin(), wavelet.end(),
-                   [&](std::size_t a, std::size_t b) { return requests[a].id.z < requests[b].id.z; });
-  make_wavelet(requests, wavelet, grounds);
+  for (auto* list : {&wavelet, &fractal}) {
+    std::stable_sort(list->begin(), list->end(), [&](std::size_t a, std::size_t b) { return requests[a].id.z < requests[b].id.z; });
+  }
+  run_batch<PreparedTask>(requests, wavelet, prepare_task, *wavelet_, grounds);
+  run_batch<PreparedFractalTask>(requests, fractal, prepare_fractal_task, *fractal_, grounds);
   return grounds;
 }
 

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "kernels/device/device.h"
+#include "kernels/fractal/fractal_synthesis.h"
 #include "kernels/synthesis/wavelet_synthesis.h"
 #include "service/config/recipe.h"
 #include "service/ground/layer.h"
@@ -44,13 +45,12 @@ class GroundMaker {
   Result<void> probe(const WaveletTask& task);
 
  private:
-  explicit GroundMaker(std::unique_ptr<WaveletSynthesis> wavelet) : wavelet_(std::move(wavelet)) {}
+  GroundMaker(std::unique_ptr<WaveletSynthesis> wavelet, std::unique_ptr<FractalSynthesis> fractal)
+      : wavelet_(std::move(wavelet)), fractal_(std::move(fractal)) {}
 
   Result<Ground> make_real(const GroundRequest& request);
-  void make_wavelet(std::span<const GroundRequest> requests, std::span<const std::size_t> which,
-                    std::vector<Result<Ground>>& grounds);
-
   std::unique_ptr<WaveletSynthesis> wavelet_;
+  std::unique_ptr<FractalSynthesis> fractal_;
 };
 
 // A square of posts of a synthetic level: posts x posts from (x0, y0), global indices; posts - 1 a power of two that divides
@@ -65,6 +65,15 @@ struct PreparedTask {
   WaveletTask task;
   std::vector<std::uint8_t> coarse_void;  // of coarse_window(task); empty: no voids
 };
+// The same for the fractal methods.
+struct PreparedFractalTask {
+  FractalTask task;
+  std::vector<std::uint8_t> coarse_void;  // of the data posts at the corners of the area's cells
+};
+Result<PreparedFractalTask> prepare_fractal_task(const Layer& layer, const Recipe& recipe, std::uint64_t seed, const GroundArea& area);
+// True for the fractal methods, on layers that are wide enough to have a roughness (at least 2 x 2 posts); others of them are
+// refined linearly.
+bool is_fractal(const Recipe& recipe, const LayerInfo& info);
 Result<PreparedTask> prepare_task(const Layer& layer, const Recipe& recipe, std::uint64_t seed, const GroundArea& area);
 
 // Heights and provenance for posts beyond the data: those of the nearest post of the data. `world`: the data's posts at the
