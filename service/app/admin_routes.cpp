@@ -142,6 +142,7 @@ http::Router public_routes(App& app) {
 
 http::Router admin_routes(App& app) {
   http::Router router;
+  add_mask_routes(router, app);
   add_admin_routes(router, app);
   add_health_routes(router, app);
   return router;

@@ -99,9 +99,11 @@ Result<std::shared_ptr<const Layer>> Layer::open(const std::filesystem::path& da
                                                  std::size_t decoded_bytes, std::size_t model_bytes) {
   auto store = LayerStore::open(data_dir, name, decoded_bytes);
   if (!store) return store.error();
+  auto masks = MaskStore::open(data_dir, (*store)->info());
+  if (!masks) return masks.error();
   auto crs = CrsTransform::create((*store)->info().crs_wkt);
   if (!crs) return std::move(crs.error()).within("opening layer " + name);
-  const std::shared_ptr<Layer> layer(new Layer(*store, nullptr, *crs, model_bytes));
+  const std::shared_ptr<Layer> layer(new Layer(*store, *masks, *crs, model_bytes));
   const std::string stored = (*store)->roughness_json();
   if (!stored.empty()) {
     auto models = models_from_json(stored);
