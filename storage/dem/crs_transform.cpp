@@ -15,13 +15,19 @@ using TransformPtr = std::unique_ptr<OGRCoordinateTransformation, TransformDelet
 
 class ProjTransform final : public CrsTransform {
  public:
-  ProjTransform(TransformPtr to_layer, TransformPtr to_wgs84) : to_layer_(std::move(to_layer)), to_wgs84_(std::move(to_wgs84)) {}
+  ProjTransform(TransformPtr to_layer, TransformPtr to_wgs84)
+      : to_layer_(std::move(to_layer)), to_wgs84_(std::move(to_wgs84)) {}
 
-  void layer_from_wgs84(std::span<double> x, std::span<double> y, std::span<bool> ok) override { run(*to_layer_, x, y, ok); }
-  void wgs84_from_layer(std::span<double> x, std::span<double> y, std::span<bool> ok) override { run(*to_wgs84_, x, y, ok); }
+  void layer_from_wgs84(std::span<double> x, std::span<double> y, std::span<bool> ok) override {
+    run(*to_layer_, x, y, ok);
+  }
+  void wgs84_from_layer(std::span<double> x, std::span<double> y, std::span<bool> ok) override {
+    run(*to_wgs84_, x, y, ok);
+  }
 
  private:
-  void run(OGRCoordinateTransformation& transform, std::span<double> x, std::span<double> y, std::span<bool> ok) {
+  void run(OGRCoordinateTransformation& transform, std::span<double> x, std::span<double> y,
+           std::span<bool> ok) {
     std::vector<int> good(x.size(), 0);
     {
       const std::lock_guard lock(mutex_);
@@ -48,9 +54,11 @@ Result<std::shared_ptr<CrsTransform>> CrsTransform::create(const std::string& la
   TransformPtr to_layer(OGRCreateCoordinateTransformation(&wgs84, &layer));
   TransformPtr to_wgs84(OGRCreateCoordinateTransformation(&layer, &wgs84));
   if (!to_layer || !to_wgs84) {
-    return Error{ErrorCode::kInvalidArgument, "PROJ knows no transformation between WGS84 and the layer's CRS"};
+    return Error{ErrorCode::kInvalidArgument,
+                 "PROJ knows no transformation between WGS84 and the layer's CRS"};
   }
-  return std::shared_ptr<CrsTransform>(std::make_shared<ProjTransform>(std::move(to_layer), std::move(to_wgs84)));
+  return std::shared_ptr<CrsTransform>(
+      std::make_shared<ProjTransform>(std::move(to_layer), std::move(to_wgs84)));
 }
 
 }  // namespace lodestone

@@ -28,7 +28,7 @@ namespace fs = std::filesystem;
 
 constexpr std::size_t kCommitBytes = std::size_t{16} << 20;
 constexpr std::size_t kReadBudgetBytes = std::size_t{64} << 20;  // of all workers' read buffers together
-constexpr std::size_t kDecodedBytes = std::size_t{96} << 20;
+constexpr std::size_t kDecodedBytes = std::size_t{64} << 20;
 constexpr std::size_t kMaxWaiting = 64;  // encoded tiles between workers and the writer
 constexpr int kOrderBlock = 8;  // tiles are visited in blocks of 8 x 8, so that neighbours are still decoded
 
@@ -77,7 +77,7 @@ class Batch {
  public:
   explicit Batch(LmdbEnv& env) : env_(env) {}
   Result<void> add(KeyValue item) {
-    bytes_ += item.value.size();
+    bytes_ += item.value.size() + sizeof item + item.key.capacity();
     items_.push_back(std::move(item));
     return bytes_ < kCommitBytes ? Result<void>() : flush();
   }

@@ -12,7 +12,7 @@ namespace {
 
 // After so many bytes read, mapped pages are let go: they stay in the page cache, but not in our resident
 // set.
-constexpr std::size_t kForgetEveryBytes = std::size_t{64} << 20;
+constexpr std::size_t kForgetEveryBytes = std::size_t{32} << 20;
 constexpr unsigned kMaxReaders = 1024;
 
 struct TxnCloser {

@@ -48,15 +48,16 @@ struct ZstdCloser {
   void operator()(ZSTD_DCtx* c) const noexcept { ZSTD_freeDCtx(c); }
 };
 
-// Appends the zstd frame of `raw` to `out` and returns its size.
+// Appends the zstd frame of `raw` to `out` and returns its size. Packed aside: many values wait in memory at
+// once, and must not hold on to the room that zstd might have needed.
 std::uint32_t append_packed(std::vector<std::uint8_t>& out, std::span<const std::uint8_t> raw) {
   thread_local const std::unique_ptr<ZSTD_CCtx, ZstdCloser> context(ZSTD_createCCtx());
-  const std::size_t at = out.size();
-  out.resize(at + ZSTD_compressBound(raw.size()));
+  thread_local std::vector<std::uint8_t> packed;
+  packed.resize(ZSTD_compressBound(raw.size()));
   const std::size_t size =
-      ZSTD_compressCCtx(context.get(), out.data() + at, out.size() - at, raw.data(), raw.size(), kZstdLevel);
+      ZSTD_compressCCtx(context.get(), packed.data(), packed.size(), raw.data(), raw.size(), kZstdLevel);
   assert(!ZSTD_isError(size) && "zstd failed in a buffer of its own bound");
-  out.resize(at + size);
+  out.insert(out.end(), packed.begin(), packed.begin() + static_cast<std::ptrdiff_t>(size));
   return static_cast<std::uint32_t>(size);
 }
 
