@@ -146,9 +146,10 @@ class Planner {
     }
     g.i0 = static_cast<ls_uint>(w.i0 * (1 + square));
     g.j0 = static_cast<ls_uint>(w.j0 * (1 + square));
-    const ls_uint algo =
-        square ? LS_ALGO_SQUARE_SQUARE
-               : (task_.method == FractalMethod::kDiamondSquare ? LS_ALGO_DIAMOND_SQUARE : LS_ALGO_OSTROWSKI);
+    const ls_uint algo = square                                          ? LS_ALGO_SQUARE_SQUARE
+                         : task_.method == FractalMethod::kDiamondSquare ? LS_ALGO_DIAMOND_SQUARE
+                         : task_.parameters.is_flora                     ? LS_ALGO_FLORA
+                                                                         : LS_ALGO_OSTROWSKI;
     g.stream = ls_stream(static_cast<ls_uint>(task_.base_level + s_ + square), static_cast<ls_uint>(band),
                          algo, static_cast<ls_uint>(task_.parameters.channel));
     return g;

@@ -35,6 +35,7 @@ struct FractalParameters {
   bool erosion = false;          // no new point below the lowest of its four neighbours ..
   std::optional<float> water_m;  // .. where the ground is above this level
   int channel = 0;               // 0 heights, 1..3 colours of an image
+  bool is_flora = false;         // a density of plants: random numbers of its own
   bool operator==(const FractalParameters&) const = default;
 };
 

@@ -1,5 +1,5 @@
-// Time of one tile by each fractal method, beside the wavelet synthesis (gsa) that it is compared with, on the OpenCL device
-// and in the plain twin. Compare rows of one run only.
+// Time of one tile by each fractal method, beside the wavelet synthesis (gsa) that it is compared with, on
+// the OpenCL device and in the plain twin. Compare rows of one run only.
 
 #include <benchmark/benchmark.h>
 
@@ -48,7 +48,8 @@ void run_fractal(benchmark::State& state, FractalMethod method, bool ruled, bool
   const FractalTask task = fractal_task(method, static_cast<int>(state.range(0)), ruled);
   std::vector<std::vector<float>> out(1);
   for (auto _ : state) {
-    if (Result<void> done = engine->run({&task, 1}, out); !done) return state.SkipWithError(done.error().message.c_str());
+    if (Result<void> done = engine->run({&task, 1}, out); !done)
+      return state.SkipWithError(done.error().message.c_str());
     benchmark::DoNotOptimize(out[0].data());
   }
   state.SetItemsProcessed(state.iterations() * kPosts * kPosts);
@@ -78,21 +79,36 @@ void run_gsa(benchmark::State& state, bool on_device) {
     for (std::int64_t i = c.i0; i <= c.i1; ++i) t.coarse_m.push_back(world().at(i, j));
   std::vector<std::vector<float>> out(1);
   for (auto _ : state) {
-    if (Result<void> done = engine->run({&t, 1}, out); !done) return state.SkipWithError(done.error().message.c_str());
+    if (Result<void> done = engine->run({&t, 1}, out); !done)
+      return state.SkipWithError(done.error().message.c_str());
     benchmark::DoNotOptimize(out[0].data());
   }
   state.SetItemsProcessed(state.iterations() * kPosts * kPosts);
 }
 
 void BM_Gsa(benchmark::State& state) { run_gsa(state, true); }
-void BM_SquareSquare(benchmark::State& state) { run_fractal(state, FractalMethod::kSquareSquare, false, true); }
-void BM_DiamondSquare(benchmark::State& state) { run_fractal(state, FractalMethod::kDiamondSquare, false, true); }
-void BM_FractalWavelet(benchmark::State& state) { run_fractal(state, FractalMethod::kFractalWavelet, false, true); }
-void BM_FractalWaveletErosion(benchmark::State& state) { run_fractal(state, FractalMethod::kFractalWavelet, true, true); }
+void BM_SquareSquare(benchmark::State& state) {
+  run_fractal(state, FractalMethod::kSquareSquare, false, true);
+}
+void BM_DiamondSquare(benchmark::State& state) {
+  run_fractal(state, FractalMethod::kDiamondSquare, false, true);
+}
+void BM_FractalWavelet(benchmark::State& state) {
+  run_fractal(state, FractalMethod::kFractalWavelet, false, true);
+}
+void BM_FractalWaveletErosion(benchmark::State& state) {
+  run_fractal(state, FractalMethod::kFractalWavelet, true, true);
+}
 void BM_GsaHost(benchmark::State& state) { run_gsa(state, false); }
-void BM_SquareSquareHost(benchmark::State& state) { run_fractal(state, FractalMethod::kSquareSquare, false, false); }
-void BM_DiamondSquareHost(benchmark::State& state) { run_fractal(state, FractalMethod::kDiamondSquare, false, false); }
-void BM_FractalWaveletHost(benchmark::State& state) { run_fractal(state, FractalMethod::kFractalWavelet, false, false); }
+void BM_SquareSquareHost(benchmark::State& state) {
+  run_fractal(state, FractalMethod::kSquareSquare, false, false);
+}
+void BM_DiamondSquareHost(benchmark::State& state) {
+  run_fractal(state, FractalMethod::kDiamondSquare, false, false);
+}
+void BM_FractalWaveletHost(benchmark::State& state) {
+  run_fractal(state, FractalMethod::kFractalWavelet, false, false);
+}
 BENCHMARK(BM_Gsa)->ArgName("depth")->Arg(1)->Arg(4)->Arg(8)->Arg(16);
 BENCHMARK(BM_SquareSquare)->ArgName("depth")->Arg(1)->Arg(4)->Arg(8)->Arg(16);
 BENCHMARK(BM_DiamondSquare)->ArgName("depth")->Arg(1)->Arg(4)->Arg(8)->Arg(16);
