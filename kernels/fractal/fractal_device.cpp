@@ -17,7 +17,7 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
       : device_(std::move(device)), queue_(make_queue(device_->context(), device_->id())) {
     for (std::size_t n = 0; n < kKernelCount; ++n)
       kernels_[n] = make_kernel(device_->program("fractal"), kernel_name(static_cast<FractalKernel>(n)));
-    device_->warm_up("fractal", [] {});  // keeps the built program
+    device_->warm_up("fractal", [this] { run_small_tiles(); });
   }
 
   Result<void> run(std::span<const FractalTask> tasks, std::span<std::vector<float>> heights_m) override {
@@ -34,6 +34,39 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
   }
 
  private:
+  // Launches every kernel once: PoCL compiles a kernel at its first launch, which must not happen in a request.
+  void run_small_tiles() {
+    FractalTask task;
+    task.world = {0, 0, 8, 8};
+    task.depth = 2;
+    task.posts = 17;
+    std::vector<float> heights_m;
+    for (const FractalMethod method :
+         {FractalMethod::kSquareSquare, FractalMethod::kDiamondSquare, FractalMethod::kFractalWavelet}) {
+      for (const bool has_rules : {false, true}) {
+        for (const bool has_mask : {false, true}) {
+          task.method = method;
+          task.parameters.erosion = has_rules;
+          if (has_rules) task.parameters.altitude = AltitudeRule{};
+          const PostWindow coarse = coarse_window(task);
+          task.coarse_m.assign(static_cast<std::size_t>(coarse.width() * coarse.height()), 1.0F);
+          const PostWindow nodes = node_window(task, 4);
+          const PostWindow all = layer_nodes(task.world, 4);
+          task.nodes = {4, nodes.i0, nodes.j0, static_cast<int>(nodes.width()), static_cast<int>(nodes.height()), all.width(), all.height(), {}};
+          task.nodes.nodes.assign(static_cast<std::size_t>(nodes.width() * nodes.height()), {1.0F, 0.8F});
+          task.mask.reset();
+          if (has_mask) {
+            const PostWindow pixels = mask_window(task, 0);
+            task.mask = MaskCrop{0, pixels.i0, pixels.j0, static_cast<int>(pixels.width()), static_cast<int>(pixels.height()), {}};
+            task.mask->pixels.assign(static_cast<std::size_t>(pixels.width() * pixels.height()), 100);
+          }
+          run_one(task, heights_m);
+        }
+      }
+      task.parameters = {};
+    }
+  }
+
   void run_one(const FractalTask& task, std::vector<float>& heights_m) {
     const FractalPlan plan = make_plan(task);
     for (std::size_t slot = 0; slot < kSlotCount; ++slot)
