@@ -26,7 +26,7 @@ START_LIMIT_S = 60
 # One layer with the default tiles (base level 1), one with small tiles (base level 3) for arithmetic in plain Python.
 BIG, SMALL = 'jacksboro', 'small'
 WAVELET_RECIPES = ('linear', 'gsa', 'lsa')
-ALL_RECIPES = WAVELET_RECIPES + ('square-square', 'diamond-square', 'fractal-wavelet')
+ALL_RECIPES = WAVELET_RECIPES
 
 
 def program():
@@ -344,10 +344,9 @@ def read_exr(data):
 
 def exr_text(attributes, name):
     kind, value = attributes[name]
-    if kind == 'string':
-        return value.decode()
-    return {'int': lambda: struct.unpack('<i', value)[0], 'float': lambda: struct.unpack('<f', value)[0],
-            'double': lambda: struct.unpack('<d', value)[0]}.get(kind, lambda: value)()
+    if kind != 'string':
+        raise AssertionError(f'EXR attribute {name} is of type {kind}, not string')
+    return value.decode()
 
 
 def read_png(data):
@@ -442,11 +441,12 @@ def sample_heights():
 def _analysed(x):
     """Coarse samples of one line, amplitude normalisation, whole-sample mirror at both ends."""
     x = list(x)
+    coarse_count = (len(x) + 1) // 2
     if len(x) % 2 == 0:
         x.append(x[-2])
     d = [x[n + 1] - (x[n] + x[n + 2]) * 0.5 for n in range(0, len(x) - 2, 2)]
     d = [d[0], *d, d[-1]]
-    return [x[2 * n] + (d[n] + d[n + 1]) * 0.25 for n in range((len(x) + 1) // 2)]
+    return [x[2 * n] + (d[n] + d[n + 1]) * 0.25 for n in range(coarse_count)]
 
 
 def analysed(grid):
