@@ -48,7 +48,12 @@ void locate(const Layer& layer, int z, std::vector<Point>& points) {
     y[n] = points[n].lat;
   }
   layer.crs().layer_from_wgs84(x, y, {ok.get(), points.size()});
-  const PostWindow world = info.world_at(z);
+  PostWindow world = info.world_at(z);
+  if (z < info.base_level) {
+    // The data may end between two posts of a coarser level; the post behind its border is in the tile, filled.
+    const int up = info.base_level - z;
+    world = {floor_shift(info.world.i0, up), floor_shift(info.world.j0, up), ceil_shift(info.world.i1, up), ceil_shift(info.world.j1, up)};
+  }
   for (std::size_t n = 0; n < points.size(); ++n) {
     if (!ok[n]) continue;
     const auto post = info.post_from_world(z, x[n], y[n]);
@@ -181,9 +186,7 @@ Result<TileKey> height_key(const Catalog& catalog, const http::Request& request,
       return Error{ErrorCode::kInvalidArgument, fmt::format("z={}: must be a level of layer {}, 0..{}", *z_text, info.name, deepest)};
     }
   }
-  if (const auto v = request.query("v"); v && *v != key.layer->revision()) {
-    return Error{ErrorCode::kGone, fmt::format("revision {} of layer {} is not in force any more; the current one is {}", *v, info.name, key.layer->revision())};
-  }
+  if (auto ok = check_revision(*key.layer, request); !ok) return ok.error();
   key.id.z = z;
   key.format = TileFormat::kGround;
   return key;

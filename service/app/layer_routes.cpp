@@ -1,4 +1,4 @@
-// GET /, /layers, /layers/{layer}, /tiles/{layer}/{recipe}/tilejson.json. Statuses: 200, 304, 400, 404.
+// GET /, /layers, /layers/{layer}, /tiles/{layer}/{recipe}/tilejson.json. Statuses: 200, 400, 404, 410.
 
 #include <fmt/format.h>
 
@@ -139,6 +139,7 @@ void serve_tilejson(App& app, const RequestPtr& request, http::Responder respond
   if (!layer) return send_error(*request, responder, layer.error());
   auto recipe = catalog->recipe(request->param("recipe"));
   if (!recipe) return send_error(*request, responder, recipe.error());
+  if (auto ok = check_revision(**layer, *request); !ok) return send_error(*request, responder, ok.error());
   const std::string encoding(request->query("encoding").value_or("terrarium"));
   if (encoding != "terrarium" && encoding != "mapbox") {
     return send_error(*request, responder, {ErrorCode::kInvalidArgument, "query encoding=" + encoding + ": must be terrarium or mapbox"});

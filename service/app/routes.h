@@ -19,4 +19,7 @@ http::Handler with_token(const App& app, http::Handler handler);
 // The key of a tile request: layer, recipe, seed, revision, address, format. Errors: kNotFound, kInvalidArgument, kGone.
 Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& request);
 
+// The query's ?v= against the layer's revision. Errors: kInvalidArgument (not a revision), kGone (another one).
+Result<void> check_revision(const Layer& layer, const http::Request& request);
+
 }  // namespace lodestone

@@ -137,13 +137,17 @@ Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& reque
                                                    key.recipe_name, key.recipe.depth_limit, key.layer->info().base_level)};
   }
   if (auto ok = set_format(key, request.param("ext"), request.target.query); !ok) return ok.error();
-  if (const auto v = request.query("v"); v && *v != key.layer->revision()) {
-    const bool is_revision = v->size() == 16 && v->find_first_not_of("0123456789abcdef") == std::string_view::npos;
-    if (!is_revision) return Error{ErrorCode::kInvalidArgument, fmt::format("query v={}: must be a revision, 16 hexadecimal digits", *v)};
-    return Error{ErrorCode::kGone, fmt::format("revision {} of layer {} is not in force any more; the current one is {}", *v,
-                                               key.layer->info().name, key.layer->revision())};
-  }
+  if (auto ok = check_revision(*key.layer, request); !ok) return ok.error();
   return key;
+}
+
+Result<void> check_revision(const Layer& layer, const http::Request& request) {
+  const auto v = request.query("v");
+  if (!v || *v == layer.revision()) return {};
+  const bool is_revision = v->size() == 16 && v->find_first_not_of("0123456789abcdef") == std::string_view::npos;
+  if (!is_revision) return Error{ErrorCode::kInvalidArgument, fmt::format("query v={}: must be a revision, 16 hexadecimal digits", *v)};
+  return Error{ErrorCode::kGone, fmt::format("revision {} of layer {} is not in force any more; the current one is {}", *v,
+                                             layer.info().name, layer.revision())};
 }
 
 void add_tile_routes(http::Router& router, App& app) {

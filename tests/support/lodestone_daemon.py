@@ -60,6 +60,13 @@ class Workspace:
             done = run('ingest', SAMPLE, '--layer', layer, '--data-dir', self.template, '--datum', 'EGM96', *options)
             if done.returncode != 0:
                 raise RuntimeError(f'ingest of the sample failed ({done.returncode}): {done.stderr}')
+        # Once on the device, so that every copy brings the compiled kernels along.
+        with Daemon(self.template) as daemon:
+            for recipe in ALL_RECIPES:
+                daemon.tile(SMALL, recipe, 4, 0, 0)
+            if daemon.stop() != 0:
+                raise RuntimeError(f'the first daemon did not end well: {daemon.log()}')
+        shutil.rmtree(os.path.join(self.template, 'cache'), ignore_errors=True)
 
     def path(self, name):
         return os.path.join(self.root, name)
