@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import socket
+import struct
 import time
 import unittest
 
@@ -264,7 +265,7 @@ class Documents(unittest.TestCase):
                 one = self.daemon.get(f'/heights/{SMALL}/{recipe}?lon={lon!r}&lat={lat!r}&z={z}').json()
                 self.assertEqual((one['height_m'], one['provenance']), (answer['height_m'], answer['provenance']))
                 self.assertAlmostEqual(one['height_m'], height, delta=0.02 if z > 10 else 2e-3, msg=f'{recipe} {z} {lon} {lat}')
-                self.assertEqual(one['provenance'], 'synthetic' if z > base else 'surveyed')
+                self.assertIn(one['provenance'], ('synthetic',) if z > base else ('surveyed',) if z == base else ('surveyed', 'filled'))
         outside = self.daemon.request('POST', f'/heights/{SMALL}/lsa', None, b'{"points": [[0, 0], [-84.3, 36.6]]}').json()['points']
         self.assertEqual((outside[0]['height_m'], outside[0]['provenance']), (None, 'outside'))
         self.assertGreater(outside[1]['height_m'], 200)
@@ -318,7 +319,8 @@ class Crowds(unittest.TestCase):
             socks = [daemon.connect() for _ in range(200)]
             for n, sock in enumerate(socks):
                 sock.sendall(f'GET /tiles/{BIG}/lsa/17/{n}/9.exr?compression=piz HTTP/1.1\r\nHost: a\r\n\r\n'.encode())
-            for sock in socks:
+            for sock in socks:  # a reset: a mere end of sending would still be answered
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
                 sock.close()
             wait_until(lambda: daemon.metrics()['lodestone_queue_tiles'] == 0 and daemon.metrics()['lodestone_running_tiles'] == 0, 'an empty queue')
             wait_until(lambda: daemon.metrics()['lodestone_connections_open'] <= 1, 'closed connections')

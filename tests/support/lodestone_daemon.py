@@ -26,7 +26,7 @@ START_LIMIT_S = 60
 # One layer with the default tiles (base level 1), one with small tiles (base level 3) for arithmetic in plain Python.
 BIG, SMALL = 'jacksboro', 'small'
 WAVELET_RECIPES = ('linear', 'gsa', 'lsa')
-ALL_RECIPES = WAVELET_RECIPES
+ALL_RECIPES = WAVELET_RECIPES + ('square-square', 'diamond-square', 'fractal-wavelet')
 
 
 def program():
