@@ -216,7 +216,7 @@ class Documents(unittest.TestCase):
                     continue
                 documented = set(operation['responses'])
                 is_admin = bool(operation.get('security'))
-                body = bodies.get(path, b'{}') if method in ('post', 'put') else None
+                body = None if method not in ('post', 'put') else bodies.get(path, b'{}') if 'requestBody' in operation else b''
                 for headers in ([{'Authorization': f'Bearer {ld.TOKEN}'}, {}] if is_admin else [{}]):
                     for query in (queries.get(path, '') if method == 'get' else '', '?no-such-key=1'):
                         reply = self.daemon.request(method.upper(), address + query, headers, body, admin=is_admin)
