@@ -135,6 +135,7 @@ http::Router public_routes(App& app) {
   http::Router router;
   add_layer_routes(router, app);
   add_tile_routes(router, app);
+  add_terrain_routes(router, app);
   add_height_routes(router, app);
   add_health_routes(router, app);
   return router;

@@ -6,7 +6,8 @@
 
 namespace lodestone {
 
-void add_tile_routes(http::Router& router, App& app);    // /tiles/...
+void add_tile_routes(http::Router& router, App& app);    // /tiles/..., /cesium/...
+void add_terrain_routes(http::Router& router, App& app); // /tiles/.../layer.json
 void add_layer_routes(http::Router& router, App& app);   // /, /layers, tilejson.json
 void add_height_routes(http::Router& router, App& app);  // /heights/...
 void add_health_routes(http::Router& router, App& app);  // /healthz, /readyz, /metrics, /openapi.json
@@ -16,7 +17,8 @@ void add_admin_routes(http::Router& router, App& app);   // admin: purge, reload
 // Wraps a handler of the admin listener: 401 without `Authorization: Bearer <LODESTONE_ADMIN_TOKEN>`.
 http::Handler with_token(const App& app, http::Handler handler);
 
-// The key of a tile request: layer, recipe, seed, revision, address, format. Errors: kNotFound, kInvalidArgument, kGone.
+// The key of a tile request: layer, recipe, seed, revision, address (TMS rows without an "ext" parameter), format; for
+// .terrain also what Accept and Accept-Encoding say. Errors: kNotFound, kInvalidArgument, kGone.
 Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& request);
 
 // The query's ?v= against the layer's revision. Errors: kInvalidArgument (not a revision), kGone (another one).

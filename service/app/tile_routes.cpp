@@ -1,7 +1,8 @@
-// GET /tiles/{layer}/{recipe}/{z}/{x}/{y}.{ext}. Statuses: 200, 304, 400, 404, 406, 410, 500, 503.
+// GET /tiles/{layer}/{recipe}/{z}/{x}/{y}.{ext}, /cesium/{layer}/{recipe}/{z}/{x}/{y}.terrain. Statuses: 200, 304, 400, 404, 406, 410, 500, 503.
 
 #include <fmt/format.h>
 
+#include <charconv>
 #include <unordered_map>
 
 #include "service/app/respond.h"
@@ -18,6 +19,19 @@ struct Resolved {
   std::string etag, cache_control;
 };
 
+bool is_terrain(const http::Request& request) { return request.param("ext").empty() || request.param("ext") == "terrain"; }
+
+// What the fields of a .terrain request add to its target: extensions and coding.
+struct TerrainFields {
+  std::uint8_t extensions = 0;
+  bool is_gzip = false;
+};
+TerrainFields terrain_fields(const http::Request& request) {
+  const auto accept = request.joined_header("Accept");
+  return {terrain_extensions(accept ? *accept : std::string()),
+          http::negotiate_coding(request.joined_header("Accept-Encoding"), true) == http::Coding::kGzip};
+}
+
 // Used by the io thread only.
 class ResolvedTargets {
  public:
@@ -26,7 +40,11 @@ class ResolvedTargets {
       known_.clear();
       version_ = catalog->version;
     }
-    const std::string target(request.raw_target);
+    std::string target(request.raw_target);
+    if (is_terrain(request)) {
+      const TerrainFields fields = terrain_fields(request);
+      target += fmt::format(" {}{}", fields.extensions, fields.is_gzip ? "z" : "");
+    }
     if (const auto found = known_.find(target); found != known_.end()) return found->second;
     auto key = tile_key_from(*catalog, request);
     if (!key) return key.error();
@@ -67,6 +85,12 @@ std::string timing_text(const TileAnswer& answer) {
                      answer.encode_ms);
 }
 
+void set_terrain_fields(const TileKey& key, http::Response& response) {
+  if (key.format != TileFormat::kTerrain) return;
+  response.set("Vary", "Accept, Accept-Encoding");
+  if (key.mesh.is_gzip && response.status == 200) response.set("Content-Encoding", "gzip");
+}
+
 http::Response tile_response(const Resolved& resolved, const TileAnswer& answer) {
   const CachedTilePtr& tile = *answer.tile;
   http::Response response;
@@ -76,6 +100,7 @@ http::Response tile_response(const Resolved& resolved, const TileAnswer& answer)
       .set("Lodestone-Max-Error-M", fmt::format("{:.6g}", tile->max_error_m))
       .set("Lodestone-Provenance", provenance_text(tile->provenance))
       .set("Server-Timing", timing_text(answer));
+  set_terrain_fields(resolved.key, response);
   response.body = http::Body(tile, tile->body.data(), tile->body.size());
   return response;
 }
@@ -84,7 +109,7 @@ void serve_tile(App& app, const std::shared_ptr<ResolvedTargets>& targets, const
                 http::Responder responder) {
   auto resolved = targets->get(app.catalog(), *request);
   if (!resolved) return send_error(*request, responder, resolved.error());
-  if (!http::negotiate_coding(request->joined_header("Accept-Encoding"), false)) {
+  if (!http::negotiate_coding(request->joined_header("Accept-Encoding"), is_terrain(*request))) {
     return responder.send(http::problem_response(406, "tiles are sent as they are (identity), which Accept-Encoding excludes", request->raw_target));
   }
   const auto none_match = request->joined_header("If-None-Match");
@@ -93,6 +118,7 @@ void serve_tile(App& app, const std::shared_ptr<ResolvedTargets>& targets, const
     http::Response response;
     response.status = 304;
     response.set("ETag", (*resolved)->etag).set("Cache-Control", (*resolved)->cache_control);
+    set_terrain_fields((*resolved)->key, response);
     return responder.send(std::move(response));
   }
   const auto shared = std::make_shared<http::Responder>(std::move(responder));
@@ -105,6 +131,22 @@ void serve_tile(App& app, const std::shared_ptr<ResolvedTargets>& targets, const
                                         }
                                       });
   if (ticket != 0) shared->on_abandoned([&app, ticket] { app.tiles().leave(ticket); });
+}
+
+// The row counted from the north as text, of one counted from the south; what is not a number stays as it is.
+std::string row_from_tms(std::string_view z, std::string_view y) {
+  int level = 0;
+  std::int64_t row = 0;
+  const auto level_end = std::from_chars(z.data(), z.data() + z.size(), level);
+  const auto row_end = std::from_chars(y.data(), y.data() + y.size(), row);
+  const bool is_leading_zero = y.size() > 1 && y[0] == '0';
+  if (level_end.ec != std::errc() || level_end.ptr != z.data() + z.size() || row_end.ec != std::errc() ||
+      row_end.ptr != y.data() + y.size() || is_leading_zero || level < 0 || level > 60 || row < 0) {
+    return std::string(y);
+  }
+  const std::int64_t rows = std::int64_t{1} << level;
+  // Beyond the grid: a row that no layer has.
+  return std::to_string(row < rows ? rows - 1 - row : rows);
 }
 
 }  // namespace
@@ -129,14 +171,35 @@ Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& reque
     key.seed = *parsed;
   }
   key.recipe.seed = 0;  // only the default; the seed in force is a part of the key of its own
-  auto id = parse_tile_id(key.layer->info(), request.param("z"), request.param("x"), request.param("y"));
-  if (!id) return id.error();
-  key.id = *id;
+  const LayerInfo& info = key.layer->info();
+  const bool is_cesium = request.param("ext").empty();
+  if (is_cesium && info.grid == GridKind::kNative) {
+    return Error{ErrorCode::kInvalidArgument, fmt::format("layer {} has the grid native; CesiumJS needs a layer ingested with --grid "
+                                                          "WorldCRS84Quad or WebMercatorQuad",
+                                                          info.name)};
+  }
+  std::string y(request.param("y"));
+  if (is_cesium) y = row_from_tms(request.param("z"), y);
+  const bool is_root = is_cesium && info.grid == GridKind::kWorldCrs84Quad && request.param("z") == "0" && y == "0" &&
+                       (request.param("x") == "0" || request.param("x") == "1");
+  if (is_root && !info.has_tile({0, request.param("x") == "1" ? 1 : 0, 0})) {
+    key.id = {0, request.param("x") == "1" ? 1 : 0, 0};
+    key.mesh.is_flat = true;
+  } else {
+    auto id = parse_tile_id(info, request.param("z"), request.param("x"), y);
+    if (!id) return id.error();
+    key.id = *id;
+  }
   if (key.id.z > key.layer->info().base_level + key.recipe.depth_limit) {
     return Error{ErrorCode::kNotFound, fmt::format("level {} is deeper than recipe {} goes: {} levels below base level {}", key.id.z,
                                                    key.recipe_name, key.recipe.depth_limit, key.layer->info().base_level)};
   }
-  if (auto ok = set_format(key, request.param("ext"), request.target.query); !ok) return ok.error();
+  if (auto ok = set_format(key, is_cesium ? "terrain" : request.param("ext"), request.target.query); !ok) return ok.error();
+  if (key.format == TileFormat::kTerrain) {
+    const TerrainFields fields = terrain_fields(request);
+    key.mesh.extensions = fields.extensions;
+    key.mesh.is_gzip = fields.is_gzip;
+  }
   if (auto ok = check_revision(*key.layer, request); !ok) return ok.error();
   return key;
 }
@@ -153,6 +216,10 @@ Result<void> check_revision(const Layer& layer, const http::Request& request) {
 void add_tile_routes(http::Router& router, App& app) {
   const auto targets = std::make_shared<ResolvedTargets>();
   router.add("GET", "/tiles/{layer}/{recipe}/{z}/{x}/{y}.{ext}",
+             [&app, targets](std::shared_ptr<const http::Request> request, http::Responder responder) {
+               serve_tile(app, targets, request, std::move(responder));
+             });
+  router.add("GET", "/cesium/{layer}/{recipe}/{z}/{x}/{y}.terrain",
              [&app, targets](std::shared_ptr<const http::Request> request, http::Responder responder) {
                serve_tile(app, targets, request, std::move(responder));
              });

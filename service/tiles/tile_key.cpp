@@ -108,6 +108,10 @@ std::string TileKey::text() const {
     case TileFormat::kPng:
       out += fmt::format("{},{}", static_cast<int>(png), png_size);
       break;
+    case TileFormat::kGlb:
+    case TileFormat::kTerrain:
+      out += mesh.text();
+      break;
     case TileFormat::kF32:
     case TileFormat::kTif:
     case TileFormat::kGround:
@@ -131,12 +135,14 @@ std::string TileKey::tag() const { return layer->info().name + "/" + recipe_name
 
 Result<void> set_format(TileKey& key, std::string_view extension, const QueryList& query) {
   static const std::pair<std::string_view, TileFormat> formats[] = {
-      {"exr", TileFormat::kExr}, {"f32", TileFormat::kF32}, {"tif", TileFormat::kTif}, {"png", TileFormat::kPng}};
+      {"exr", TileFormat::kExr}, {"f32", TileFormat::kF32}, {"tif", TileFormat::kTif},
+      {"png", TileFormat::kPng}, {"glb", TileFormat::kGlb}, {"terrain", TileFormat::kTerrain}};
   const auto* found = std::find_if(std::begin(formats), std::end(formats), [&](const auto& f) { return f.first == extension; });
   if (found == std::end(formats)) {
-    return Error{ErrorCode::kNotFound, fmt::format("no tile format .{}: there are exr, f32, tif, png", extension)};
+    return Error{ErrorCode::kNotFound, fmt::format("no tile format .{}: there are exr, f32, tif, png, glb, terrain", extension)};
   }
   key.format = found->second;
+  const bool is_mesh = key.format == TileFormat::kGlb || key.format == TileFormat::kTerrain;
   key.png_size = key.layer->info().posts_per_tile - 1;
   std::string quantum = key.recipe.quantum;
   for (const auto& [name, value] : query) {
@@ -148,11 +154,15 @@ Result<void> set_format(TileKey& key, std::string_view extension, const QueryLis
       ok = set_exr_option(key, name, value);
     } else if (key.format == TileFormat::kPng && (name == "encoding" || name == "size")) {
       ok = set_png_option(key, name, value);
+    } else if (is_mesh && is_mesh_option(key.format == TileFormat::kTerrain, name)) {
+      ok = set_mesh_option(key.mesh, name, value);
     } else {
       ok = Error{ErrorCode::kInvalidArgument,
                  fmt::format("unknown query key {} for .{}: there are seed, v, quantum{}", name, extension,
                              key.format == TileFormat::kExr   ? ", compression, pixel, channels"
                              : key.format == TileFormat::kPng ? ", encoding, size"
+                             : key.format == TileFormat::kGlb ? ", mesh, error, triangles, skirt, positions, frame"
+                             : is_mesh                        ? ", error, triangles"
                                                               : "")};
     }
     if (!ok) return ok;
@@ -160,6 +170,7 @@ Result<void> set_format(TileKey& key, std::string_view extension, const QueryLis
   auto resolved = resolve_quantum(key, quantum);
   if (!resolved) return resolved.error();
   key.quantum_m = *resolved;
+  if (is_mesh) return check_mesh_options(key);
   return {};
 }
 
@@ -190,6 +201,10 @@ std::string_view content_type(TileFormat format) {
       return "image/png";
     case TileFormat::kTif:
       return "image/tiff";
+    case TileFormat::kGlb:
+      return "model/gltf-binary";
+    case TileFormat::kTerrain:
+      return "application/vnd.quantized-mesh";
     case TileFormat::kF32:
     case TileFormat::kGround:
       break;

@@ -12,6 +12,7 @@
 #include "kernels/types/tile_id.h"
 #include "service/config/recipe.h"
 #include "service/ground/layer.h"
+#include "service/tiles/mesh_tile.h"
 #include "storage/cache/memory_cache.h"
 #include "storage/formats/exr_tile.h"
 #include "storage/formats/raster_tile.h"
@@ -19,7 +20,7 @@
 namespace lodestone {
 
 // kGround is for our own use (/heights): the f32 tile followed by one Provenance byte per post.
-enum class TileFormat : std::uint8_t { kExr, kF32, kTif, kPng, kGround };
+enum class TileFormat : std::uint8_t { kExr, kF32, kTif, kPng, kGround, kGlb, kTerrain };
 
 struct TileKey {
   std::shared_ptr<const Layer> layer;
@@ -33,6 +34,7 @@ struct TileKey {
   float quantum_m = 0;  // 0: heights as they are
   PngEncoding png = PngEncoding::kTerrarium;
   int png_size = 0;     // 257 or 256 for tiles of 257 posts
+  MeshOptions mesh;     // kGlb, kTerrain
 
   std::string text() const;  // canonical: all of the above, with the layer's revision
   CacheKey hash() const;     // XXH3-128 of text()
@@ -50,7 +52,7 @@ Result<void> set_format(TileKey& key, std::string_view extension, const QueryLis
 // says what they are).
 Result<TileId> parse_tile_id(const LayerInfo& layer, std::string_view z, std::string_view x, std::string_view y);
 
-// "image/x-exr", "image/png", "image/tiff" or "application/octet-stream".
+// "image/x-exr", "image/png", "image/tiff", "model/gltf-binary", "application/vnd.quantized-mesh" or "application/octet-stream".
 std::string_view content_type(TileFormat format);
 
 }  // namespace lodestone

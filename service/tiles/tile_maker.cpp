@@ -13,8 +13,11 @@ using Clock = std::chrono::steady_clock;
 
 double ms_since(Clock::time_point start) { return std::chrono::duration<double, std::milli>(Clock::now() - start).count(); }
 
+bool is_mesh(const TileKey& key) { return key.format == TileFormat::kGlb || key.format == TileFormat::kTerrain; }
+
 bool needs_halo(const TileKey& key) {
-  return key.format == TileFormat::kPng && (key.png == PngEncoding::kHillshade || key.png == PngEncoding::kRelief);
+  const bool is_shaded = key.png == PngEncoding::kHillshade || key.png == PngEncoding::kRelief;
+  return is_mesh(key) || (key.format == TileFormat::kPng && is_shaded);
 }
 
 // Post spacing on the ground at the tile's level, metres.
@@ -27,7 +30,8 @@ std::array<double, 2> cell_m(const TileKey& key) {
 GroundRequest ground_request(const TileKey& key, const TileId& id) { return {key.layer, key.recipe, key.seed, id}; }
 
 // `centre` with one more post on every side, from the neighbours that exist; elsewhere the border post again.
-std::vector<float> with_halo(GroundMaker& maker, const TileKey& key, const Ground& centre) {
+// Errors: those of the neighbours.
+Result<std::vector<float>> with_halo(GroundMaker& maker, const TileKey& key, const Ground& centre) {
   const int n = centre.posts;
   const int wide = n + 2;
   std::vector<float> out(static_cast<std::size_t>(wide) * wide);
@@ -49,7 +53,7 @@ std::vector<float> with_halo(GroundMaker& maker, const TileKey& key, const Groun
   }
   const auto neighbours = maker.make(requests);
   for (std::size_t k = 0; k < neighbours.size(); ++k) {
-    if (!neighbours[k]) continue;  // a picture's border post repeated is better than no picture
+    if (!neighbours[k]) return neighbours[k].error();  // a tile made without them would be another one
     const auto [dx, dy] = steps[k];
     const std::vector<float>& heights = neighbours[k]->heights_m;
     const int row_first = dy < 0 ? 0 : (dy > 0 ? wide - 1 : 1);
@@ -114,14 +118,20 @@ Result<TileMaker::Made> TileMaker::encode(const TileKey& key, Ground& ground) {
   std::vector<float> halo;
   if (needs_halo(key)) {
     const auto start = Clock::now();
-    halo = with_halo(*ground_, key, ground);
+    auto wide = with_halo(*ground_, key, ground);
+    if (!wide) return std::move(wide.error()).within("reading around tile " + to_string(key.id));
+    halo = std::move(*wide);
     made.ground_ms = ms_since(start);
   }
   const auto start = Clock::now();
   if (key.quantum_m > 0) {
     if (auto ok = quantise(ground.heights_m, key.quantum_m); !ok) return ok.error();
+    if (is_mesh(key)) {
+      if (auto ok = quantise(halo, key.quantum_m); !ok) return ok.error();
+    }
   }
   Result<std::string> body = std::string();
+  double mesh_error_m = 0;
   switch (key.format) {
     case TileFormat::kF32:
       body = encode_f32_tile(ground.heights_m);
@@ -152,6 +162,17 @@ Result<TileMaker::Made> TileMaker::encode(const TileKey& key, Ground& ground) {
                              cell[1], {info.height_min_m, std::max(info.height_max_m, info.height_min_m + 1)});
       break;
     }
+    case TileFormat::kGlb:
+    case TileFormat::kTerrain: {
+      auto mesh = make_mesh_tile(key, halo, ground.provenance_bits);
+      if (mesh) {
+        body = std::move(mesh->body);
+        mesh_error_m = mesh->max_error_m;
+      } else {
+        body = mesh.error();
+      }
+      break;
+    }
   }
   if (!body) return std::move(body.error()).within("encoding tile " + to_string(key.id));
   auto tile = std::make_shared<CachedTile>();
@@ -161,7 +182,21 @@ Result<TileMaker::Made> TileMaker::encode(const TileKey& key, Ground& ground) {
   if (key.format == TileFormat::kExr) {
     for (const float h : ground.heights_m) highest = std::max(highest, std::abs(static_cast<double>(h)));
   }
-  tile->max_error_m = max_error_m(key, highest);
+  tile->max_error_m = max_error_m(key, highest) + static_cast<float>(mesh_error_m);
+  made.tile = std::move(tile);
+  made.encode_ms = ms_since(start);
+  return made;
+}
+
+Result<TileMaker::Made> TileMaker::flat(const TileKey& key) {
+  const auto start = Clock::now();
+  auto mesh = make_flat_tile(key);
+  if (!mesh) return std::move(mesh.error()).within("encoding tile " + to_string(key.id));
+  auto tile = std::make_shared<CachedTile>();
+  tile->body = std::move(mesh->body);
+  tile->max_error_m = static_cast<float>(mesh->max_error_m);
+  tile->provenance = 1U << kFilled;
+  Made made;
   made.tile = std::move(tile);
   made.encode_ms = ms_since(start);
   return made;
@@ -170,16 +205,24 @@ Result<TileMaker::Made> TileMaker::encode(const TileKey& key, Ground& ground) {
 std::vector<Result<TileMaker::Made>> TileMaker::make(std::span<const TileKey> keys) {
   const auto start = Clock::now();
   std::vector<GroundRequest> requests;
-  for (const TileKey& key : keys) requests.push_back(ground_request(key, key.id));
+  for (const TileKey& key : keys) {
+    if (!key.mesh.is_flat) requests.push_back(ground_request(key, key.id));
+  }
   std::vector<Result<Ground>> grounds = ground_->make(requests);
   const double share_ms = ms_since(start) / static_cast<double>(std::max<std::size_t>(1, keys.size()));
   std::vector<Result<Made>> out;
-  for (std::size_t n = 0; n < keys.size(); ++n) {
-    if (!grounds[n]) {
-      out.push_back(grounds[n].error());
+  std::size_t next = 0;  // of `grounds`
+  for (const TileKey& key : keys) {
+    if (key.mesh.is_flat) {
+      out.push_back(flat(key));
       continue;
     }
-    auto made = encode(keys[n], *grounds[n]);
+    Result<Ground>& ground = grounds[next++];
+    if (!ground) {
+      out.push_back(ground.error());
+      continue;
+    }
+    auto made = encode(key, *ground);
     if (made) made->ground_ms += share_ms;
     out.push_back(std::move(made));
   }

@@ -28,6 +28,7 @@ class TileMaker {
 
  private:
   Result<Made> encode(const TileKey& key, Ground& ground);
+  Result<Made> flat(const TileKey& key);  // mesh.is_flat
 
   std::unique_ptr<GroundMaker> ground_;
 };
