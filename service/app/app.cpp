@@ -60,6 +60,7 @@ Result<std::shared_ptr<Device>> open_device(const Options& options) {
       if (name.rfind("pocl-", 0) == 0 && !fs::exists("/proc/" + name.substr(5), ignored)) fs::remove_all(entry.path(), ignored);
     }
   }
+  fs::remove_all(cache, ignored);  // of a killed daemon that had the same process number
   fs::create_directories(cache, ignored);
   prepare_pocl_environment(fs::exists(cache, ignored) ? cache.string() : fs::temp_directory_path(ignored).string());
   auto files = std::make_shared<ProgramFiles>(kernels);

@@ -20,8 +20,9 @@ Error no_such(std::string_view what, std::string_view name, const Map& map) {
 
 Result<std::shared_ptr<const Layer>> Catalog::layer(std::string_view name) const {
   const auto found = layers.find(std::string(name));
-  if (found == layers.end()) return no_such("layer", name, layers);
-  return found->second;
+  if (found != layers.end()) return found->second;
+  if (const auto broken = closed.find(std::string(name)); broken != closed.end()) return broken->second;
+  return no_such("layer", name, layers);
 }
 
 Result<const Recipe*> Catalog::recipe(std::string_view name) const {
@@ -68,7 +69,13 @@ void CatalogKeeper::reload_layers() {
       continue;
     }
     next.problems.push_back(fmt::format("layer {}: {}", name, layer.error().message));
-    if (const auto old = before->layers.find(name); old != before->layers.end()) next.layers.emplace(name, old->second);
+    if (const auto old = before->layers.find(name); old != before->layers.end()) {
+      next.layers.emplace(name, old->second);
+      continue;
+    }
+    // The layer is there, so "not found" would be a lie that clients and caches believe.
+    const bool is_transient = layer.error().code == ErrorCode::kIo;
+    next.closed.emplace(name, Error{is_transient ? ErrorCode::kIo : ErrorCode::kCorrupt, next.problems.back()});
   }
   publish(std::move(next));
 }
@@ -79,6 +86,7 @@ Result<void> CatalogKeeper::reload_layer(const std::string& name) {
   if (!layer) return layer.error();
   Catalog next = *current();
   next.layers[name] = *layer;
+  next.closed.erase(name);
   publish(std::move(next));
   return {};
 }

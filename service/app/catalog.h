@@ -17,8 +17,9 @@ struct Catalog {
   std::map<std::string, std::shared_ptr<const Layer>> layers;
   std::map<std::string, Recipe> recipes;
   std::vector<std::string> problems;  // layers that did not open, with the reason
+  std::map<std::string, Error> closed;  // the same, by name; without those of which an older state is still served
 
-  // Errors: kNotFound, lists the names that exist.
+  // Errors: kNotFound, lists the names that exist; kCorrupt or kIo for a layer that is there but does not open.
   Result<std::shared_ptr<const Layer>> layer(std::string_view name) const;
   Result<const Recipe*> recipe(std::string_view name) const;
 };

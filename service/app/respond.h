@@ -24,7 +24,7 @@ inline void send_text(const http::Request& request, http::Responder& responder, 
 
 inline void send_json(const http::Request& request, http::Responder& responder, const nlohmann::ordered_json& json, int status = 200,
                       const std::string& content_type = "application/json") {
-  http::Response response = http::text_response(content_type, json.dump(1), status);
+  http::Response response = http::text_response(content_type, json.dump(1, ' ', false, nlohmann::ordered_json::error_handler_t::replace), status);
   response.set("Cache-Control", "no-cache");
   send_text(request, responder, std::move(response));
 }

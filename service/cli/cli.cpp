@@ -6,6 +6,7 @@
 #include <cstdio>
 
 #include "service/cli/commands.h"
+#include "service/http/problem.h"
 
 namespace lodestone {
 namespace {
@@ -32,7 +33,8 @@ void add_option_flags(CLI::App& command, CommonFlags& flags, bool all) {
 Result<Options> CommonFlags::load() const { return load_options(config.empty() ? std::nullopt : std::optional(config), values); }
 
 int fail(const Error& error) {
-  fmt::print(stderr, "lodestone: {}\n", error.message);
+  // Bytes of a damaged file may be in the message: what is not UTF-8 or a control character is shown as \xNN.
+  fmt::print(stderr, "lodestone: {}\n", http::safe_echo(error.message, 8000));
   return error.code == ErrorCode::kInvalidArgument ? kWrongUsage : kFailed;
 }
 

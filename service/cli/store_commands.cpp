@@ -55,7 +55,7 @@ int run_inspect(const CommonFlags& common, const std::string& only, bool is_json
     }
     for (const MaskInfo& mask : (*layer)->mask_list()) fmt::print("  mask {} ({} x {}, mean {:.4f})\n", mask.name, mask.width, mask.height, mask.mean);
   }
-  if (is_json) fmt::print("{}\n", all.dump(1));
+  if (is_json) fmt::print("{}\n", all.dump(1, ' ', false, ordered_json::error_handler_t::replace));
   if (names.empty() && !is_json) fmt::print("no layers in {}; `lodestone ingest FILE --layer NAME` makes one\n", options->data_dir);
   return kDone;
 }
@@ -95,7 +95,7 @@ int run_verify(const CommonFlags& common, const std::string& only, bool repair, 
       if (!is_json) fmt::print("cache: {}\n", disk.error().message);
     }
   }
-  if (is_json) fmt::print("{}\n", report.dump(1));
+  if (is_json) fmt::print("{}\n", report.dump(1, ' ', false, ordered_json::error_handler_t::replace));
   return problem_count == 0 ? kDone : kDoneWithFailures;
 }
 
@@ -129,7 +129,7 @@ int run_devices(const CommonFlags& common, bool is_json) {
       fmt::print("{} / {}\n  {}, {} compute units, {} MiB, driver {}, {}\n", d.platform, d.name, d.type, d.compute_units, d.global_bytes >> 20, d.driver, d.version);
     }
   }
-  if (is_json) fmt::print("{}\n", all.dump(1));
+  if (is_json) fmt::print("{}\n", all.dump(1, ' ', false, ordered_json::error_handler_t::replace));
   if (devices.empty() && !is_json) fmt::print("no OpenCL device; install pocl-opencl-icd, or set device = \"host\" to compute in plain C++\n");
   return devices.empty() ? kFailed : kDone;
 }

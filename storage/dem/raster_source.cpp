@@ -20,6 +20,8 @@ namespace {
 
 constexpr std::int64_t kMaxSide = std::int64_t{1} << 24;
 constexpr double kMaxDeclaredBytes = 1099511627776.0;  // 2^40
+constexpr double kBombBytes = 1073741824.0;            // 2^30; from here on, a file must hold at least
+constexpr double kMaxPacking = 1000;                   // one byte per so many decoded ones
 constexpr double kPostTolerance = 1e-3;                // of a post, between sources of a native grid
 constexpr float kMaxHeightM = 1e6F;                    // beyond: an untagged nodata value, never ground
 constexpr double kUsFootM = 1200.0 / 3937.0;
@@ -51,10 +53,14 @@ bool has_local_prefixes(const std::string& path) {
   return true;
 }
 
+bool is_vrt(const std::string& path) {
+  const std::string name = lower(path);
+  return name.size() > 4 && name.compare(name.size() - 4, 4, ".vrt") == 0;
+}
+
 Result<DatasetPtr> open_raster(const std::string& path) {
   std::vector<const char*> drivers(std::begin(kDrivers), std::end(kDrivers));
-  const std::string name = lower(path);
-  if (name.size() > 4 && name.compare(name.size() - 4, 4, ".vrt") == 0) drivers.push_back("VRT");
+  if (is_vrt(path)) drivers.push_back("VRT");
   drivers.push_back(nullptr);
   if (!has_local_prefixes(path)) {
     return source_error(
@@ -64,6 +70,9 @@ Result<DatasetPtr> open_raster(const std::string& path) {
   std::error_code ec;
   if (path.compare(0, 4, "/vsi") != 0 && !std::filesystem::exists(path, ec)) {
     return source_error(ErrorCode::kNotFound, path, "no such file");
+  }
+  if (path.compare(0, 4, "/vsi") != 0 && !std::filesystem::is_regular_file(path, ec)) {
+    return source_error(ErrorCode::kUnsupported, path, "is no regular file; a pipe or a device cannot be read as a raster");
   }
   CPLErrorReset();
   DatasetPtr dataset(static_cast<GDALDataset*>(
@@ -168,6 +177,16 @@ Result<void> check_band(const IngestOptions& options, const std::string& path, G
         ErrorCode::kTooLarge, path,
         std::to_string(raster.width) + " x " + std::to_string(raster.height) +
             " pixels; at most 2^24 a side and 2^40 bytes decoded; ingest it in parts as several layers");
+  }
+  // A VRT is small by nature; the operator vouches for what it names.
+  VSIStatBufL file{};
+  if (declared > kBombBytes && !is_vrt(path) && VSIStatL(path.c_str(), &file) == 0 &&
+      declared > kMaxPacking * static_cast<double>(file.st_size)) {
+    return source_error(ErrorCode::kTooLarge, path,
+                        std::to_string(raster.width) + " x " + std::to_string(raster.height) + " pixels in " +
+                            std::to_string(file.st_size) +
+                            " bytes: packed more than 1000 to 1, as no terrain is; cut it to the part that holds data "
+                            "(gdal_translate -projwin), or name it in a .vrt");
   }
   if (GDALDataTypeIsComplex(type))
     return source_error(ErrorCode::kUnsupported, path, "its band is of complex numbers, not heights");

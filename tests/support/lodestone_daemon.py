@@ -46,7 +46,7 @@ def clean_environment(extra=None):
 def run(*args, env=None, text=True, timeout=120):
     """The command line program; returns CompletedProcess with returncode, stdout, stderr."""
     return subprocess.run([program(), *map(str, args)], env=clean_environment(env), stdout=subprocess.PIPE,
-                          stderr=subprocess.PIPE, text=text, timeout=timeout, check=False)
+                          stderr=subprocess.PIPE, text=text, errors='replace' if text else None, timeout=timeout, check=False)
 
 
 class Workspace:
