@@ -20,6 +20,9 @@ namespace {
 
 constexpr double kCesiumRootError_m = 77067.34;
 constexpr int kFlatPosts = 33;
+// Down to this level a globe's tiles are even grids of kFlatPosts - 1 cells a side: a bound of kilometres would leave two triangles,
+// far below the ellipsoid in the middle. The bound holds: it is larger than the relief of the Earth.
+constexpr int kRoundLevels = 3;
 constexpr int kWaterPixels = 256;
 // Further above the data a water mask would have to be averaged whole for every tile.
 constexpr int kWaterLevelsAboveBase = 5;
@@ -68,6 +71,8 @@ PlanarFrame planar_frame(const LayerInfo& info, const TileId& id) {
 // The mesh within `error_m` inside; the tile's edges keep the bound of the options, which both neighbours know.
 Result<TinMesh> build(const TileKey& key, const PostField& field, std::optional<double> error_m, double edge_error_m) {
   const PostWindow window = key.layer->info().tile_window(key.id);
+  const bool is_round = key.format == TileFormat::kTerrain && key.id.z <= kRoundLevels && !key.mesh.error_m && !key.mesh.triangles;
+  if (is_round) return build_grid_mesh(field, window.i0, window.j0, std::max(1, (field.cols - 1) / (kFlatPosts - 1)));
   if (key.mesh.kind == MeshKind::kGrid) {
     // The step follows from the budget alone, so neighbours have the same.
     std::int32_t step = 1;

@@ -196,6 +196,7 @@ class Mesh(unittest.TestCase):
         rich = self.daemon.get(path, EXTENSIONS)
         vertices, _, _, extensions = read_terrain(rich.body)
         self.assertEqual(set(extensions), {1, 2, 4})
+        self.assertEqual(len(vertices), 33 * 33)  # round enough for a globe
         self.assertEqual(len(extensions[1]), 2 * len(vertices))
         self.assertIn('geometricerror', json.loads(extensions[4][4:]))
         coded = self.daemon.get(path, {**EXTENSIONS, 'Accept-Encoding': 'gzip'})
