@@ -403,11 +403,16 @@ def read_png(data):
 
 def make_png(width, height, pixel):
     """An 8-bit grey PNG; pixel(column, row) -> 0..255."""
+    lines = b''.join(b'\0' + bytes(pixel(column, row) for column in range(width)) for row in range(height))
+    return png_around(width, height, zlib.compress(lines))
+
+
+def png_around(width, height, packed_lines):
+    """A grey PNG that declares this size, around already deflated lines."""
     def chunk(kind, body):
         return struct.pack('>I', len(body)) + kind + body + struct.pack('>I', zlib.crc32(kind + body))
-    lines = b''.join(b'\0' + bytes(pixel(column, row) for column in range(width)) for row in range(height))
     head = struct.pack('>IIBBBBB', width, height, 8, 0, 0, 0, 0)
-    return b'\x89PNG\r\n\x1a\n' + chunk(b'IHDR', head) + chunk(b'IDAT', zlib.compress(lines)) + chunk(b'IEND', b'')
+    return b'\x89PNG\r\n\x1a\n' + chunk(b'IHDR', head) + chunk(b'IDAT', packed_lines) + chunk(b'IEND', b'')
 
 
 def make_exr(width, height, value, claimed=None):
