@@ -37,7 +37,7 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
   // Launches every kernel once: PoCL compiles a kernel at its first launch, which must not happen in a request.
   void run_small_tiles() {
     FractalTask task;
-    task.world = {0, 0, 8, 8};
+    task.world = {0, 0, 64, 64};
     task.depth = 2;
     task.posts = 17;
     std::vector<float> heights_m;
@@ -46,6 +46,7 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
       for (const bool has_rules : {false, true}) {
         for (const bool has_mask : {false, true}) {
           task.method = method;
+          task.x0 = task.y0 = has_rules ? 96 : 0;  // inside and at the border
           task.parameters.erosion = has_rules;
           if (has_rules) task.parameters.altitude = AltitudeRule{};
           const PostWindow coarse = coarse_window(task);
@@ -115,10 +116,11 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
       cl_mem plane = planes_[op.slots[static_cast<std::size_t>(n)]].get();
       LS_CL(clSetKernelArg(kernel, static_cast<cl_uint>(n + 1), sizeof(plane), &plane));
     }
-    const int per_item = op.kernel == kKernelNoise ? 16 : 1;
-    launch(queue_.get(), kernel, static_cast<std::size_t>(device_->local_size()),
-           static_cast<std::size_t>((op.columns + per_item - 1) / per_item),
-           static_cast<std::size_t>(op.rows));
+    // Wide kernels take all rows as one.
+    const bool is_wide = is_sixteen_wide(op.kernel);
+    const std::size_t columns = static_cast<std::size_t>(is_wide ? (op.columns + 15) / 16 * op.rows : op.columns);
+    launch(queue_.get(), kernel, static_cast<std::size_t>(device_->local_size()), columns,
+           is_wide ? 1 : static_cast<std::size_t>(op.rows));
   }
 
   const std::shared_ptr<Device> device_;

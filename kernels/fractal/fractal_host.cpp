@@ -62,15 +62,21 @@ class HostFractalSynthesis final : public FractalSynthesis {
         return each(op, [&](int i, int j) { ls_square_first(g, i, j, p[0], p[1], p[2]); });
       case kKernelSquareNext:
         return each(op, [&](int i, int j) { ls_square_next(g, i, j, p[0], p[1], p[2]); });
+      case kKernelSquareNextInner:
+        return each(op, [&](int i, int j) { ls_square_next_inner(g, i, j, p[0], p[1], p[2]); });
+      case kKernelSquarePostsInner:
+        return each(op, [&](int i, int j) { ls_square_post_inner(g, i, j, p[0], p[1]); });
       case kKernelSquarePosts:
         return each(op, [&](int i, int j) { ls_square_post(g, i, j, p[0], p[1]); });
       case kKernelDiamondCentres:
         return each(op, [&](int i, int j) { ls_diamond_centre(g, i, j, p[0], p[1], p[2]); });
       case kKernelDiamondQuads:
+      case kKernelDiamondQuadsInner:
         return each(op, [&](int i, int j) { ls_diamond_quad(g, i, j, p[0], p[1], p[2], p[3], p[4]); });
       case kKernelRuleCentres:
         return each(op, [&](int i, int j) { ls_rule_centre(g, i, j, p[0], p[1]); });
       case kKernelWeights:
+      case kKernelWeightsInner:
         return each(op, [&](int i, int j) { ls_weight(g, i, j, p[0], p[1]); });
       case kKernelHalf1Posts:
         return each(op, [&](int i, int j) { ls_half1_post(g, i, j, p[0], p[1], p[2]); });

@@ -132,6 +132,7 @@ class Planner {
     const BandPlace place = band_place(task_, steps_[static_cast<std::size_t>(s_)], s_, band);
     g.band = band;
     g.node_shift = place.shift + task_.nodes.node_log2;
+    g.node_scale = 1.0F / static_cast<float>(1 << g.node_shift);
     g.node_x0 = node_coordinate(place.x0, place.shift, task_.nodes.node_log2, task_.parameters.lookup);
     g.node_y0 = node_coordinate(place.y0, place.shift, task_.nodes.node_log2, task_.parameters.lookup);
     const int square = band == 0;
@@ -205,7 +206,8 @@ class Planner {
 
   void square_step(int s, FractalSlot from) {
     add_mask(add_noise(0, kSlotDelta1), kSlotDelta1);
-    add(s == 0 ? kKernelSquareFirst : kKernelSquareNext, base_, {from, kSlotDelta1, other(from)});
+    const FractalKernel next = base_.is_near_border ? kKernelSquareNext : kKernelSquareNextInner;
+    add(s == 0 ? kKernelSquareFirst : next, base_, {from, kSlotDelta1, other(from)});
   }
 
   // Output posts from the cells around them.
@@ -220,7 +222,8 @@ class Planner {
     g.hi_i = local((task_.world.i1 << task_.depth) - 1 - task_.x0);
     g.hi_j = local((task_.world.j1 << task_.depth) - 1 - task_.y0);
     need(other(cells.slot), static_cast<std::size_t>(g.pitch) * static_cast<std::size_t>(g.height));
-    add(kKernelSquarePosts, g, {cells.slot, other(cells.slot)});
+    const bool is_inner = g.lo_i < 0 && g.lo_j < 0 && g.hi_i >= g.width && g.hi_j >= g.height;
+    add(is_inner ? kKernelSquarePostsInner : kKernelSquarePosts, g, {cells.slot, other(cells.slot)});
     return {other(cells.slot), task_.x0, task_.y0, g.pitch};
   }
 
@@ -231,7 +234,8 @@ class Planner {
     add_mask(add_noise(2, kSlotDelta2), kSlotDelta2);
     add_mask(add_noise(3, kSlotDelta3), kSlotDelta3);
     add(kKernelDiamondCentres, base_, {from, kSlotDelta3, kSlotCentres});
-    add(kKernelDiamondQuads, base_, {from, kSlotCentres, kSlotDelta1, kSlotDelta2, other(from)});
+    add(base_.is_near_border ? kKernelDiamondQuads : kKernelDiamondQuadsInner, base_,
+        {from, kSlotCentres, kSlotDelta1, kSlotDelta2, other(from)});
   }
 
   void wavelet_step(FractalSlot from) {
@@ -245,7 +249,8 @@ class Planner {
 
     if (is_ruled) add(kKernelRuleCentres, centre, {from, kSlotDelta3});
     add_mask(centre, kSlotDelta3);
-    add(kKernelWeights, centre, {kSlotDelta3, kSlotWeight3});
+    const FractalKernel weights = base_.is_near_border ? kKernelWeights : kKernelWeightsInner;
+    add(weights, centre, {kSlotDelta3, kSlotWeight3});
     add(kKernelHalf1Posts, base_, {from, kSlotWeight3, kSlotPosts});
     add(kKernelHalf1Centres, base_, {kSlotPosts, kSlotDelta3, kSlotCentres});
 
@@ -253,7 +258,7 @@ class Planner {
                                               std::tuple{vertical, kSlotDelta2, kSlotWeight2}}) {
       if (is_ruled) add(kKernelRuleEdges, band, {kSlotPosts, kSlotCentres, delta});
       add_mask(band, delta);
-      add(kKernelWeights, band, {delta, weight});
+      add(weights, band, {delta, weight});
     }
     add(kKernelHalf2Old, base_,
         {kSlotPosts, kSlotCentres, kSlotWeight1, kSlotWeight2, kSlotPosts2, kSlotCentres2});
@@ -274,13 +279,42 @@ class Planner {
 
 FractalPlan make_plan(const FractalTask& task) { return Planner(task).make(); }
 
+bool is_sixteen_wide(FractalKernel kernel) {
+  switch (kernel) {
+    case kKernelNoise:
+    case kKernelSquareNextInner:
+    case kKernelDiamondQuadsInner:
+    case kKernelWeightsInner:
+    case kKernelHalf1Posts:
+    case kKernelHalf1Centres:
+    case kKernelHalf2Old:
+    case kKernelHalf2Quads:
+      return true;
+    default:
+      return false;
+  }
+}
+
 const char* kernel_name(FractalKernel kernel) {
-  constexpr std::array<const char*, kKernelCount> kNames = {
-      "ls_fractal_node_rows",       "ls_fractal_noise",         "ls_fractal_scale",
-      "ls_fractal_square_first",    "ls_fractal_square_next",   "ls_fractal_square_posts",
-      "ls_fractal_diamond_centres", "ls_fractal_diamond_quads", "ls_fractal_rule_centres",
-      "ls_fractal_weights",         "ls_fractal_half1_posts",   "ls_fractal_half1_centres",
-      "ls_fractal_rule_edges",      "ls_fractal_half2_old",     "ls_fractal_half2_quads"};
+  constexpr std::array<const char*, kKernelCount> kNames = {"ls_fractal_node_rows",
+                                                            "ls_fractal_noise",
+                                                            "ls_fractal_scale",
+                                                            "ls_fractal_square_first",
+                                                            "ls_fractal_square_next",
+                                                            "ls_fractal_square_next_inner",
+                                                            "ls_fractal_square_posts",
+                                                            "ls_fractal_square_posts_inner",
+                                                            "ls_fractal_diamond_centres",
+                                                            "ls_fractal_diamond_quads",
+                                                            "ls_fractal_diamond_quads_inner",
+                                                            "ls_fractal_rule_centres",
+                                                            "ls_fractal_weights",
+                                                            "ls_fractal_weights_inner",
+                                                            "ls_fractal_half1_posts",
+                                                            "ls_fractal_half1_centres",
+                                                            "ls_fractal_rule_edges",
+                                                            "ls_fractal_half2_old",
+                                                            "ls_fractal_half2_quads"};
   return kNames[kernel];
 }
 

@@ -33,24 +33,30 @@ enum FractalSlot : std::uint8_t {
 
 // The kernels of fractal.cl, in its order; each takes an ls_step and then the planes of FractalOp::slots.
 enum FractalKernel : std::uint8_t {
-  kKernelNodeRows,        // table, rows
-  kKernelNoise,           // rows, delta
-  kKernelScale,           // keep, delta
-  kKernelSquareFirst,     // heights, delta, heights
-  kKernelSquareNext,      // heights, delta, heights
-  kKernelSquarePosts,     // heights, heights
-  kKernelDiamondCentres,  // heights, delta, centres
-  kKernelDiamondQuads,    // heights, centres, delta, delta, heights
-  kKernelRuleCentres,     // heights, delta
-  kKernelWeights,         // delta, weight
-  kKernelHalf1Posts,      // heights, weight, posts
-  kKernelHalf1Centres,    // posts, delta, centres
-  kKernelRuleEdges,       // posts, centres, delta
-  kKernelHalf2Old,        // posts, centres, weight, weight, posts2, centres2
-  kKernelHalf2Quads,      // posts2, centres2, delta, delta, heights
+  kKernelNodeRows,         // table, rows
+  kKernelNoise,            // rows, delta
+  kKernelScale,            // keep, delta
+  kKernelSquareFirst,      // heights, delta, heights
+  kKernelSquareNext,       // heights, delta, heights
+  kKernelSquareNextInner,  // the same away from the border
+  kKernelSquarePosts,      // heights, heights
+  kKernelSquarePostsInner,
+  kKernelDiamondCentres,     // heights, delta, centres
+  kKernelDiamondQuads,       // heights, centres, delta, delta, heights
+  kKernelDiamondQuadsInner,  // the same away from the border
+  kKernelRuleCentres,        // heights, delta
+  kKernelWeights,            // delta, weight
+  kKernelWeightsInner,       // the same away from the border
+  kKernelHalf1Posts,         // heights, weight, posts
+  kKernelHalf1Centres,       // posts, delta, centres
+  kKernelRuleEdges,          // posts, centres, delta
+  kKernelHalf2Old,           // posts, centres, weight, weight, posts2, centres2
+  kKernelHalf2Quads,         // posts2, centres2, delta, delta, heights
   kKernelCount
 };
 const char* kernel_name(FractalKernel kernel);
+// Takes 16 items of a row of pitch items per work-item.
+bool is_sixteen_wide(FractalKernel kernel);
 
 struct FractalOp {
   FractalKernel kernel;

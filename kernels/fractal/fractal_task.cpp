@@ -123,8 +123,8 @@ NodeRange node_range(std::int64_t x0, int count, int shift, int node_log2, NodeL
   const std::int64_t t = node_coordinate(x0, shift, node_log2, lookup);
   const int all = static_cast<int>(nodes);
   const int smooth = lookup == NodeLookup::kSmooth;
-  return {ls_nodes_at(t, shift + node_log2, smooth, all, 0, all).n0,
-          ls_nodes_at(t + 2 * std::int64_t{count - 1}, shift + node_log2, smooth, all, 0, all).n1};
+  return {ls_nodes_at(t, shift + node_log2, 0.0F, smooth, all, 0, all).n0,
+          ls_nodes_at(t + 2 * std::int64_t{count - 1}, shift + node_log2, 0.0F, smooth, all, 0, all).n1};
 }
 
 PostWindow node_window(const FractalTask& task, int node_log2) {

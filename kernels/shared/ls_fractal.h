@@ -29,6 +29,7 @@ typedef struct {
   int parity;                  /* (i + j) & 1 of item (0, 0), global */
   /* noise of one band */
   int band;                    /* 0 square-square, 1 horizontal edges, 2 vertical edges, 3 centres */
+  float node_scale; /* 2^-node_shift */
   int node_shift, node_smooth; /* node_smooth 0: mean of the nodes that touch the point */
   int nodes_x, nodes_y;        /* of the whole layer */
   int crop_x, crop_y, crop_w, crop_h, table_at;
@@ -42,13 +43,13 @@ typedef struct {
 LS_FN int ls_clamp_int(int v, int lo, int hi) { return v < lo ? lo : (v > hi ? hi : v); }
 
 /* Two nodes of one axis and the weight of the second. t: node coordinate (centre of node 0 = 0 in smooth lookup, border of node 0
-   = 0 in the other) times 2^shift. Indices are relative to the crop and clamped to it. */
+   = 0 in the other) times 2^shift; scale: 2^-shift. Indices are relative to the crop and clamped to it. */
 typedef struct {
   int n0, n1;
   float f;
 } ls_node_pair;
 
-LS_FN ls_node_pair ls_nodes_at(ls_long t, int shift, int is_smooth, int nodes, int crop, int crop_count) {
+LS_FN ls_node_pair ls_nodes_at(ls_long t, int shift, float scale, int is_smooth, int nodes, int crop, int crop_count) {
   ls_node_pair p;
   ls_long n0 = t >> shift, n1 = n0;
   float f = 0.0f;
@@ -64,7 +65,7 @@ LS_FN ls_node_pair ls_nodes_at(ls_long t, int shift, int is_smooth, int nodes, i
       f = 1.0f;
     } else {
       n1 = n0 + 1;
-      f = (float)(int)(t - (n0 << shift)) / (float)(1 << shift);
+      f = (float)(int)(t - (n0 << shift)) * scale;
     }
   } else {
     if (n0 > 0 && t == (n0 << shift)) {
@@ -85,13 +86,13 @@ LS_FN ls_node_pair ls_nodes_at(ls_long t, int shift, int is_smooth, int nodes, i
 /* rows[r][i]: deviations of node row r, interpolated at item column i. */
 LS_FN void ls_node_row(const ls_step* g, int i, int r, const LS_GLOBAL float* table, LS_GLOBAL float* rows) {
   const ls_node_pair p =
-      ls_nodes_at(g->node_x0 + 2 * (ls_long)i, g->node_shift, g->node_smooth, g->nodes_x, g->crop_x, g->crop_w);
+      ls_nodes_at(g->node_x0 + 2 * (ls_long)i, g->node_shift, g->node_scale, g->node_smooth, g->nodes_x, g->crop_x, g->crop_w);
   const LS_GLOBAL float* a = table + g->table_at + r * g->crop_w;
   rows[r * g->pitch + i] = a[p.n0] + p.f * (a[p.n1] - a[p.n0]);
 }
 
 LS_FN ls_node_pair ls_node_rows_at(const ls_step* g, int j) {
-  return ls_nodes_at(g->node_y0 + 2 * (ls_long)j, g->node_shift, g->node_smooth, g->nodes_y, g->crop_y, g->crop_h);
+  return ls_nodes_at(g->node_y0 + 2 * (ls_long)j, g->node_shift, g->node_scale, g->node_smooth, g->nodes_y, g->crop_y, g->crop_h);
 }
 
 /* Last valid item of the band in x and y: cells end one before posts. */
@@ -133,11 +134,10 @@ LS_FN void ls_square_first(const ls_step* g, int i, int j, const LS_GLOBAL float
   out[s + 1] = ls_quarter(e1, e0) + noise[s + 1];
 }
 
-/* Later steps: item = parent cell; neighbours beyond the world are the cell itself. */
-LS_FN void ls_square_next(const ls_step* g, int i, int j, const LS_GLOBAL float* parent, const LS_GLOBAL float* noise,
-                          LS_GLOBAL float* out) {
+/* Later steps: item = parent cell; neighbours beyond the world are the cell itself. has_w ..: which neighbours exist. */
+LS_FN void ls_square_quad(const ls_step* g, int i, int j, int has_w, int has_e, int has_n, int has_s,
+                          const LS_GLOBAL float* parent, const LS_GLOBAL float* noise, LS_GLOBAL float* out) {
   const int m = g->parent_at + j * g->parent_pitch + i, u = m - g->parent_pitch, d = m + g->parent_pitch;
-  const int has_w = i > g->lo_i, has_e = i < g->hi_i, has_n = j > g->lo_j, has_s = j < g->hi_j;
   const float wm = ls_quarter(parent[m], has_w ? parent[m - 1] : parent[m]);
   const float em = ls_quarter(parent[m], has_e ? parent[m + 1] : parent[m]);
   const float wu = ls_quarter(parent[u], has_w ? parent[u - 1] : parent[u]);
@@ -151,14 +151,34 @@ LS_FN void ls_square_next(const ls_step* g, int i, int j, const LS_GLOBAL float*
   out[s + 1] = ls_quarter(em, has_s ? ed : em) + noise[s + 1];
 }
 
+LS_FN void ls_square_next(const ls_step* g, int i, int j, const LS_GLOBAL float* parent, const LS_GLOBAL float* noise,
+                          LS_GLOBAL float* out) {
+  ls_square_quad(g, i, j, i > g->lo_i, i < g->hi_i, j > g->lo_j, j < g->hi_j, parent, noise, out);
+}
+
+/* ls_square_next() where every neighbour exists. */
+LS_FN void ls_square_next_inner(const ls_step* g, int i, int j, const LS_GLOBAL float* parent, const LS_GLOBAL float* noise,
+                                LS_GLOBAL float* out) {
+  ls_square_quad(g, i, j, 1, 1, 1, 1, parent, noise, out);
+}
+
 /* Output posts: mean of the four cells around post (i, j). */
-LS_FN void ls_square_post(const ls_step* g, int i, int j, const LS_GLOBAL float* cells, LS_GLOBAL float* out) {
+LS_FN void ls_square_mean(const ls_step* g, int i, int j, int has_w, int has_e, int has_n, int has_s,
+                          const LS_GLOBAL float* cells, LS_GLOBAL float* out) {
   const int se = g->parent_at + j * g->parent_pitch + i, ne = se - g->parent_pitch;
-  const int has_w = i > g->lo_i, has_e = i <= g->hi_i, has_n = j > g->lo_j, has_s = j <= g->hi_j;
   const float nw_v = has_w ? cells[ne - 1] : cells[ne], ne_v = has_e ? cells[ne] : cells[ne - 1];
   const float sw_v = has_w ? cells[se - 1] : cells[se], se_v = has_e ? cells[se] : cells[se - 1];
   const float n = (nw_v + ne_v) * 0.5f, s = (sw_v + se_v) * 0.5f;
   out[j * g->pitch + i] = ((has_n ? n : s) + (has_s ? s : n)) * 0.5f;
+}
+
+LS_FN void ls_square_post(const ls_step* g, int i, int j, const LS_GLOBAL float* cells, LS_GLOBAL float* out) {
+  ls_square_mean(g, i, j, i > g->lo_i, i <= g->hi_i, j > g->lo_j, j <= g->hi_j, cells, out);
+}
+
+/* ls_square_post() where every cell exists. */
+LS_FN void ls_square_post_inner(const ls_step* g, int i, int j, const LS_GLOBAL float* cells, LS_GLOBAL float* out) {
+  ls_square_mean(g, i, j, 1, 1, 1, 1, cells, out);
 }
 
 /* ---- diamond-square ---- */
