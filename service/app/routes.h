@@ -10,6 +10,7 @@ void add_tile_routes(http::Router& router, App& app);    // /tiles/..., /cesium/
 void add_terrain_routes(http::Router& router, App& app); // /tiles/.../layer.json
 void add_layer_routes(http::Router& router, App& app);   // /, /layers, tilejson.json
 void add_height_routes(http::Router& router, App& app);  // /heights/...
+void add_view_routes(http::Router& router, App& app);    // /view/...
 void add_health_routes(http::Router& router, App& app);  // /healthz, /readyz, /metrics, /openapi.json
 void add_mask_routes(http::Router& router, App& app);    // admin: masks
 void add_admin_routes(http::Router& router, App& app);   // admin: purge, reload
