@@ -138,6 +138,7 @@ http::Router public_routes(App& app) {
   add_terrain_routes(router, app);
   add_height_routes(router, app);
   add_view_routes(router, app);
+  add_viewer_routes(router, app);
   add_health_routes(router, app);
   return router;
 }

@@ -102,7 +102,7 @@ std::string landing_html(const Catalog& catalog) {
          "<meta name=\"viewport\" content=\"width=device-width\"><style>body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;"
          "max-width:60rem;padding:0 1rem;color:#222}section{display:flex;gap:1.5rem;margin:1.5rem 0;flex-wrap:wrap}"
          "img{background:#ddd;border-radius:4px}h2{margin:0}</style><h1>Lodestone</h1>"
-         "<p>Real ground, with synthetic detail below it. <a href=\"/layers\">layers</a> <a href=\"/openapi.json\">API</a> "
+         "<p>Real ground, with synthetic detail below it. <a href=\"/viewer/\">viewer</a> <a href=\"/layers\">layers</a> <a href=\"/openapi.json\">API</a> "
          "<a href=\"/metrics\">metrics</a></p>\n" +
          body + "</html>\n";
 }

@@ -11,6 +11,7 @@ void add_terrain_routes(http::Router& router, App& app); // /tiles/.../layer.jso
 void add_layer_routes(http::Router& router, App& app);   // /, /layers, tilejson.json
 void add_height_routes(http::Router& router, App& app);  // /heights/...
 void add_view_routes(http::Router& router, App& app);    // /view/...
+void add_viewer_routes(http::Router& router, App& app);  // /viewer/
 void add_health_routes(http::Router& router, App& app);  // /healthz, /readyz, /metrics, /openapi.json
 void add_mask_routes(http::Router& router, App& app);    // admin: masks
 void add_admin_routes(http::Router& router, App& app);   // admin: purge, reload

@@ -1,0 +1,1 @@
+export {WebGLRenderer,Scene,PerspectiveCamera,BufferGeometry,BufferAttribute,Mesh,MeshLambertMaterial,DirectionalLight,HemisphereLight,Color,Vector3,Fog} from 'three';
