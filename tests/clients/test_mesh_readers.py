@@ -1,18 +1,14 @@
 """The Khronos glTF validator and HERE's quantized-mesh decoder read what the codec tests write."""
 import os
 import pathlib
-import shutil
 import subprocess
 import tempfile
 import unittest
 
+from clients import install_packages
+
 HERE = pathlib.Path(__file__).resolve().parent
 PROGRAMS = pathlib.Path(os.environ.get("LODESTONE_BIN", HERE.parents[1] / "build/dev/lodestone")).resolve().parent / "tests"
-
-
-def install_packages():
-    if not (HERE / "node_modules" / "gltf-validator").is_dir() or not (HERE / "node_modules" / "@here").is_dir():
-        subprocess.run([shutil.which("npm") or "npm", "ci", "--no-audit", "--no-fund", "--silent"], cwd=HERE, check=True)
 
 
 class MeshReaders(unittest.TestCase):
