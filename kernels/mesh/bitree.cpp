@@ -28,7 +28,7 @@ Result<void> check(const BitreeRequest& request) {
     return invalid("bitree: " + std::to_string(all * all) + " heights expected for the tile and its halo, " + std::to_string(field.heights_m.size()) + " found");
   }
   const auto is_tolerance = [](const std::optional<double>& t) { return !t || (std::isfinite(*t) && *t >= 0); };
-  if (!request.threshold_m && !request.max_error_m) return invalid("bitree: threshold_m or max_error_m expected, neither found");
+  if (!request.threshold_m && !request.max_error_m && !request.keeps_all) return invalid("bitree: threshold_m, max_error_m or keeps_all expected, none found");
   if (!is_tolerance(request.threshold_m)) return invalid("bitree: threshold_m must be a finite number >= 0");
   if (!is_tolerance(request.max_error_m)) return invalid("bitree: max_error_m must be a finite number >= 0");
   if (request.wavelet_levels < 1) return invalid("bitree: wavelet_levels must be at least 1, " + std::to_string(request.wavelet_levels) + " found");
@@ -164,10 +164,10 @@ Result<Bitree> build_bitree(const BitreeRequest& request) {
   tree.n = std::countr_zero(static_cast<std::uint32_t>(request.field.cols - 1));
   tree.z_offset_m = request.z_offset_m;
   tree.z_step_m = request.z_step_m;
-  std::vector<std::uint8_t> kept(q.size(), 0);
-  if (request.threshold_m) kept = select_by_wavelet(q, tree.n, std::min(request.wavelet_levels, tree.n), *request.threshold_m / request.z_step_m);
-  if (request.is_edge_shared) select_edges(request, q, kept, tree.n);
-  if (request.max_error_m) select_by_error(request, q, kept, tree.n);
+  std::vector<std::uint8_t> kept(q.size(), request.keeps_all ? 1 : 0);
+  if (request.threshold_m && !request.keeps_all) kept = select_by_wavelet(q, tree.n, std::min(request.wavelet_levels, tree.n), *request.threshold_m / request.z_step_m);
+  if (request.is_edge_shared && !request.keeps_all) select_edges(request, q, kept, tree.n);
+  if (request.max_error_m && !request.keeps_all) select_by_error(request, q, kept, tree.n);
   const int width = 1 << tree.n;
   for (const int row : {0, width}) {
     for (const int col : {0, width}) kept[tree.index(row, col)] = 1;

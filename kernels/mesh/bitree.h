@@ -47,7 +47,9 @@ struct BitreeRequest {
   int wavelet_levels = 4;          // groups reach 2^wavelet_levels posts; posts on multiples of that stay. 1..n (more is taken as n)
   // Bounded rule: no post is farther than this from the surface, quantisation included. Needs z_step_m <= 2 * max_error_m.
   std::optional<double> max_error_m;
-  // At least one rule is given; with both, a post that either wants is kept.
+  // Keeps every post: the shortest stream of a lossless tile (no states to tell), at the most triangles. The other rules are then idle.
+  bool keeps_all = false;
+  // At least one rule is given; with both tolerances, a post that either wants is kept.
   // Edge posts are chosen from the edge alone (midpoints that miss their parents' mean by more than the smaller of the two
   // tolerances, and in wavelet mode multiples of 2^wavelet_levels), so that neighbouring tiles have the same edge surface.
   // false: the wavelet rule as published, edges included.

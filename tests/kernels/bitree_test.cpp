@@ -294,6 +294,16 @@ TEST(BitreeQuadtree, HasRealHeightsAtEveryVertex) {
   EXPECT_LE(bitree->max_error_m, 10);
 }
 
+TEST(BitreeSelection, KeepsEveryPostWhenAsked) {
+  const std::vector<float> heights = test::heights_of(Kind::kInteger, 0, 0, 33, 33, 0, 8);
+  BitreeRequest request = request_for(heights, 33);
+  request.keeps_all = true;
+  const Bitree tree = built(request);
+  EXPECT_EQ(tree.selected, 33U * 33U);
+  EXPECT_EQ(tree.fictitious, 0U);
+  EXPECT_EQ(measure_bitree_error(tree, request.field).max_m, 0);
+}
+
 TEST(BitreeRequests, AreRefusedWithTheRuleTheyBreak) {
   std::vector<float> heights(81, 1);
   const auto code_of = [&](auto change) {
