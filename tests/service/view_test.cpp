@@ -103,7 +103,9 @@ TEST_F(View, KeepsTheErrorBoundAndTheStatedIterations) {
   for (int n = 0; n < 100; ++n) {
     const Camera camera = random_camera();
     for (const ViewTile& tile : select(camera).tiles) {
-      if (tile.id.z < info.max_level()) EXPECT_LE(tile.error_px, 2) << to_string(tile.id);
+      if (tile.id.z < info.max_level()) {
+        EXPECT_LE(tile.error_px, 2) << to_string(tile.id);
+      }
       EXPECT_EQ(tile.iterations, std::max(0, tile.id.z - info.base_level));
     }
   }
@@ -124,7 +126,9 @@ TEST_F(View, NeighboursDifferByAtMostOneLevelWhenBalanced) {
           for (const auto& [dx, dy] : {std::pair{-1, 0}, {1, 0}, {0, -1}, {0, 1}}) {
             for (int up = 2; up <= id.z; ++up) {
               const bool is_there = tiles.count({id.z - up, floor_shift(id.x + dx, up), floor_shift(id.y + dy, up)}) != 0;
-              if (is_balanced) EXPECT_FALSE(is_there) << to_string(id);
+              if (is_balanced) {
+                EXPECT_FALSE(is_there) << to_string(id);
+              }
               uneven += is_there && !is_balanced;
             }
           }
