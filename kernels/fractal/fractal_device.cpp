@@ -36,10 +36,15 @@ class DeviceFractalSynthesis final : public FractalSynthesis {
  private:
   // Launches every kernel once: PoCL compiles a kernel at its first launch, which must not happen in a request.
   void run_small_tiles() {
+    // Every size of launch, by one thread: see the wavelet's.
+    for (const int posts : {17, 257}) run_small_tiles(posts);
+  }
+
+  void run_small_tiles(int posts) {
     FractalTask task;
     task.world = {0, 0, 64, 64};
     task.depth = 2;
-    task.posts = 17;
+    task.posts = posts;
     std::vector<float> heights_m;
     for (const FractalMethod method :
          {FractalMethod::kSquareSquare, FractalMethod::kDiamondSquare, FractalMethod::kFractalWavelet}) {

@@ -108,21 +108,36 @@ class DeviceSynthesis final : public WaveletSynthesis {
  private:
   // One tile per basis that needs every kernel.
   void run_small_tiles() {
+    // PoCL's table of compiled kernels breaks (an assertion ends the process) when two threads are the first to launch the same
+    // variant of a kernel, and it makes variants by launch size: so tiles of all sizes and kinds are run here, by one thread.
+    for (const int posts : {5, 257}) {
+      for (const int depth : {1, 4}) {
+        for (const WaveletBasis basis : {WaveletBasis::kCdf22, WaveletBasis::kCdf44}) {
+          for (const WaveletMethod method : {WaveletMethod::kLsa, WaveletMethod::kGsa, WaveletMethod::kLinear}) {
+            for (const bool has_mask : {true, false}) run_warm_tile(posts, depth, basis, method, has_mask);
+          }
+        }
+      }
+    }
+  }
+
+  void run_warm_tile(int posts, int depth, WaveletBasis basis, WaveletMethod method, bool has_mask) {
     WaveletTask task;
-    task.world = {0, 0, 4, 4};
-    task.posts = 5;
-    task.method = WaveletMethod::kLsa;
-    for (const WaveletBasis basis : {WaveletBasis::kCdf22, WaveletBasis::kCdf44}) {
-      task.basis = basis;
-      const PostWindow coarse = coarse_window(task), pixels = mask_window(task, 0);
-      task.coarse_m.assign(area(static_cast<std::size_t>(coarse.width()), static_cast<std::size_t>(coarse.height())), 0.0f);
-      for (SigmaMap& map : task.maps) map = {0, 0, 2, 2, 2, 2, std::vector<float>(4, 1.0f), std::vector<float>(4, 0.5f)};
+    task.world = {0, 0, 256, 256};
+    task.posts = posts;
+    task.depth = depth;
+    task.basis = basis;
+    task.method = method;
+    const PostWindow coarse = coarse_window(task), pixels = mask_window(task, 0);
+    task.coarse_m.assign(area(static_cast<std::size_t>(coarse.width()), static_cast<std::size_t>(coarse.height())), 0.0f);
+    for (SigmaMap& map : task.maps) map = {0, 0, 128, 128, 128, 128, std::vector<float>(128 * 128, 1.0f), std::vector<float>(128 * 128, 0.5f)};
+    if (has_mask) {
       task.mask = MaskCrop{0, pixels.i0, pixels.j0, static_cast<int>(pixels.width()), static_cast<int>(pixels.height()), {}};
       task.mask->pixels.assign(area(static_cast<std::size_t>(pixels.width()), static_cast<std::size_t>(pixels.height())), 100);
-      const std::vector<WaveletPlan> plans{plan_task(task)};
-      std::vector<float> heights;
-      run_batch(shape_of(task, plans.front()), {&task, 1}, plans, {&heights, 1});
     }
+    const std::vector<WaveletPlan> plans{plan_task(task)};
+    std::vector<float> heights;
+    run_batch(shape_of(task, plans.front()), {&task, 1}, plans, {&heights, 1});
   }
 
   void run_batch(const BatchShape& shape, std::span<const WaveletTask> tasks, const std::vector<WaveletPlan>& plans,
