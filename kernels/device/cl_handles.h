@@ -4,8 +4,11 @@
 #define CL_USE_DEPRECATED_OPENCL_1_2_APIS
 #include <CL/cl.h>
 
+#include <functional>
 #include <memory>
+#include <mutex>
 #include <string>
+#include <unordered_set>
 #include <utility>
 
 #include "kernels/types/result.h"
@@ -120,7 +123,28 @@ void set_args(cl_kernel kernel, const Args&... args) {
 inline void launch(cl_command_queue queue, cl_kernel kernel, std::size_t local_size, std::size_t items, std::size_t rows) {
   const std::size_t global[2] = {(items + local_size - 1) / local_size * local_size, rows};
   const std::size_t local[2] = {local_size, 1};
-  LS_CL(clEnqueueNDRangeKernel(queue, kernel, 2, nullptr, global, local, 0, nullptr, nullptr));
+  // PoCL's table of compiled kernels breaks (an assertion ends the process) when two threads are the first to launch the same
+  // variant of a kernel; variants depend on the sizes. So the first launch of a kernel at a size has the process to itself.
+  static std::mutex mutex;
+  static std::unordered_set<std::size_t> met;  // guarded by mutex
+  thread_local std::unordered_set<std::size_t> met_here;
+  char name[64] = {};
+  LS_CL(clGetKernelInfo(kernel, CL_KERNEL_FUNCTION_NAME, sizeof name, name, nullptr));
+  const std::size_t variant = std::hash<std::string>()(std::string(name) + '/' + std::to_string(global[0]) + '/' +
+                                                       std::to_string(rows) + '/' + std::to_string(local_size));
+  const auto enqueue = [&] { LS_CL(clEnqueueNDRangeKernel(queue, kernel, 2, nullptr, global, local, 0, nullptr, nullptr)); };
+  if (met_here.contains(variant)) return enqueue();
+  {
+    const std::lock_guard lock(mutex);
+    if (met.insert(variant).second) {
+      enqueue();
+      LS_CL(clFinish(queue));
+      met_here.insert(variant);
+      return;
+    }
+  }
+  met_here.insert(variant);
+  enqueue();
 }
 
 }  // namespace lodestone
