@@ -59,11 +59,12 @@ class BadRasterTest(unittest.TestCase):
     def try_ingest(self, raster):
         """Exit status. The old layer must survive a refusal; it is put back after a success."""
         data = self.data_dir()
-        began = time.monotonic()
-        result = rig.lodestone("ingest", raster, "--layer", "old", "--posts-per-tile", 65, "--data-dir", data, timeout=20)
-        took_s = time.monotonic() - began
+        try:
+            result = rig.lodestone("ingest", raster, "--layer", "old", "--posts-per-tile", 65, "--data-dir", data, timeout=20)
+        except subprocess.TimeoutExpired:
+            is_file = pathlib.Path(raster).is_file()
+            self.fail(f"{raster} is still being read after 20 s; its bytes: {pathlib.Path(raster).read_bytes()[:8192].hex() if is_file else 'no file'}")
         self.assertIn(result.returncode, (0, 1, 2), f"{raster}: {result.returncode} {result.stderr}")
-        self.assertLess(took_s, 20, raster)
         if result.returncode != 0:
             self.assertEqual(self.layer_files(data), self.spare.files, f"{raster} changed the old layer")
             lines = [l for l in result.stderr.splitlines() if not l.rstrip().endswith(("read", "fill", "levels", "roughness", "publish"))]
