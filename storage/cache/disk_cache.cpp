@@ -368,8 +368,10 @@ class LmdbDiskCache final : public DiskCache {
 
     CacheEnv::Work work{removes, touches, writes};
     CacheEnv::Done done = env_->apply(work);
-    // The map is full although the budget is not (free pages lie scattered): make more room each time.
+    // The map is full although the budget is not: free pages lie scattered, or a reader that sleeps in the middle of its work keeps
+    // the pages of all commits since. Wait for the readers, keep new ones out meanwhile, and make more room each time.
     for (int attempt = 1; done.code == MDB_MAP_FULL && attempt <= 4; ++attempt) {
+      const std::unique_lock no_readers(env_mutex_);
       CacheEnv::Work room;
       room.extra_bytes = std::min(options_.budget_bytes, batch_bytes + options_.budget_bytes / 16 * attempt);
       const CacheEnv::Done made = env_->apply(room);
