@@ -162,21 +162,9 @@ void gather(App& app, const TileKey& base, std::vector<Point> points, const Requ
 // The key but for the tile's address; z from "z" or the base level.
 Result<TileKey> height_key(const Catalog& catalog, const http::Request& request, const std::optional<std::string>& z_text,
                            const std::optional<std::string>& seed_text) {
-  TileKey key;
-  auto layer = catalog.layer(request.param("layer"));
-  if (!layer) return layer.error();
-  key.layer = *layer;
-  key.recipe_name = request.param("recipe");
-  auto recipe = catalog.recipe(key.recipe_name);
-  if (!recipe) return recipe.error();
-  key.recipe = **recipe;
-  key.seed = key.recipe.seed;
-  key.recipe.seed = 0;
-  if (seed_text) {
-    auto seed = parse_seed(*seed_text);
-    if (!seed) return seed.error();
-    key.seed = *seed;
-  }
+  auto ground = ground_key(catalog, request, seed_text);
+  if (!ground) return ground.error();
+  TileKey key = std::move(*ground);
   const LayerInfo& info = key.layer->info();
   const int deepest = info.base_level + key.recipe.depth_limit;
   int z = info.base_level;

@@ -23,6 +23,10 @@ http::Handler with_token(const App& app, http::Handler handler);
 // .terrain also what Accept and Accept-Encoding say. Errors: kNotFound, kInvalidArgument, kGone.
 Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& request);
 
+// Layer, recipe and seed of a request's key: path parameters, and the seed's text where one is given. Errors: kNotFound,
+// kInvalidArgument.
+Result<TileKey> ground_key(const Catalog& catalog, const http::Request& request, std::optional<std::string_view> seed_text);
+
 // The query's ?v= against the layer's revision. Errors: kInvalidArgument (not a revision), kGone (another one).
 Result<void> check_revision(const Layer& layer, const http::Request& request);
 

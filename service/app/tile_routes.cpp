@@ -151,7 +151,7 @@ std::string row_from_tms(std::string_view z, std::string_view y) {
 
 }  // namespace
 
-Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& request) {
+Result<TileKey> ground_key(const Catalog& catalog, const http::Request& request, std::optional<std::string_view> seed_text) {
   TileKey key;
   auto layer = catalog.layer(request.param("layer"));
   if (!layer) return layer.error();
@@ -160,17 +160,24 @@ Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& reque
   auto recipe = catalog.recipe(key.recipe_name);
   if (!recipe) return recipe.error();
   key.recipe = **recipe;
+  key.seed = key.recipe.seed;
+  if (seed_text) {
+    auto seed = parse_seed(*seed_text);
+    if (!seed) return seed.error();
+    key.seed = *seed;
+  }
+  key.recipe.seed = 0;  // only the default; the seed in force is a part of the key of its own
+  return key;
+}
+
+Result<TileKey> tile_key_from(const Catalog& catalog, const http::Request& request) {
   std::set<std::string> seen;
   for (const auto& [name, value] : request.target.query) {
     if (!seen.insert(name).second) return Error{ErrorCode::kInvalidArgument, "query key " + name + " was given twice"};
   }
-  key.seed = key.recipe.seed;
-  if (const auto seed = request.query("seed")) {
-    auto parsed = parse_seed(*seed);
-    if (!parsed) return parsed.error();
-    key.seed = *parsed;
-  }
-  key.recipe.seed = 0;  // only the default; the seed in force is a part of the key of its own
+  auto ground = ground_key(catalog, request, request.query("seed"));
+  if (!ground) return ground.error();
+  TileKey key = std::move(*ground);
   const LayerInfo& info = key.layer->info();
   const bool is_cesium = request.param("ext").empty();
   if (is_cesium && info.grid == GridKind::kNative) {

@@ -62,6 +62,18 @@ std::vector<std::uint8_t> synthetic_provenance(const GroundArea& area, int depth
   return out;
 }
 
+// Where a task lies, and its seed.
+template <class Task>
+void set_place(const LayerInfo& info, std::uint64_t seed, const GroundArea& area, Task& task) {
+  task.world = info.world;
+  task.base_level = info.base_level;
+  task.depth = area.z - info.base_level;
+  task.x0 = area.x0;
+  task.y0 = area.y0;
+  task.posts = area.posts;
+  task.seed = seed;
+}
+
 // The masks of a task: voids around it, and the layer's masks that the recipe names.
 template <class Task>
 Result<void> set_masks(const Layer& layer, const Recipe& recipe, Task& task) {
@@ -106,18 +118,18 @@ Result<PreparedTask> prepare_task(const Layer& layer, const Recipe& recipe, std:
   const LayerInfo& info = layer.info();
   PreparedTask prepared;
   WaveletTask& task = prepared.task;
-  task.world = info.world;
-  task.base_level = info.base_level;
-  task.depth = area.z - info.base_level;
-  task.x0 = area.x0;
-  task.y0 = area.y0;
-  task.posts = area.posts;
-  task.seed = seed;
+  set_place(info, seed, area, task);
   task.basis = recipe.basis;
   task.lookup = recipe.lookup;
   task.method = recipe.method == Method::kGsa   ? WaveletMethod::kGsa
                 : recipe.method == Method::kLsa ? WaveletMethod::kLsa
                                                 : WaveletMethod::kLinear;
+  if (info.world.width() < 2 || info.world.height() < 2) {
+    // A single row or column has no cells, so no variance to continue: linear, on the row beside itself.
+    task.method = WaveletMethod::kLinear;
+    task.world.i1 = std::max(task.world.i1, task.world.i0 + 1);
+    task.world.j1 = std::max(task.world.j1, task.world.j0 + 1);
+  }
   auto coarse = layer.store().read_window(info.base_level, coarse_window(task));
   if (!coarse) return coarse.error();
   task.coarse_m = std::move(coarse->heights_m);
@@ -153,13 +165,7 @@ Result<PreparedFractalTask> prepare_fractal_task(const Layer& layer, const Recip
   const LayerInfo& info = layer.info();
   PreparedFractalTask prepared;
   FractalTask& task = prepared.task;
-  task.world = info.world;
-  task.base_level = info.base_level;
-  task.depth = area.z - info.base_level;
-  task.x0 = area.x0;
-  task.y0 = area.y0;
-  task.posts = area.posts;
-  task.seed = seed;
+  set_place(info, seed, area, task);
   task.method = recipe.method == Method::kSquareSquare    ? FractalMethod::kSquareSquare
                 : recipe.method == Method::kDiamondSquare ? FractalMethod::kDiamondSquare
                                                           : FractalMethod::kFractalWavelet;

@@ -5,6 +5,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <fstream>
 #include <random>
 
 #include "tests/support/layers.h"
@@ -227,6 +228,42 @@ TEST_P(Ground, HeightsAreFiniteAtEveryLevel) {
   for (const Recipe& recipe : wavelet_recipes()) {
     for (const int depth : {1, 7, 16}) {
       for (const float h : tile(recipe, 3, random_tile(depth))) ASSERT_TRUE(std::isfinite(h)) << recipe_text(recipe) << depth;
+    }
+  }
+}
+
+// Layers without a single cell: every recipe gives the straight line through the posts, at any depth.
+TEST(ThinLayers, AreRefinedAlongTheirOnlyRowOrColumn) {
+  const DataDir dir;
+  auto maker = GroundMaker::create(nullptr);
+  ASSERT_TRUE(maker);
+  for (const auto& [columns, rows] : {std::pair(1, 1), std::pair(1, 5), std::pair(5, 1)}) {
+    const std::string name = "thin" + std::to_string(columns) + "x" + std::to_string(rows);
+    const std::filesystem::path raster = dir.path() / (name + ".asc");
+    std::ofstream grid(raster);
+    grid << "ncols " << columns << "\nnrows " << rows << "\nxllcorner 10\nyllcorner 50\ncellsize 0.001\n";
+    for (int n = 0; n < columns * rows; ++n) grid << 100 + 16 * n << (columns > 1 ? ' ' : '\n');
+    grid << "\n";
+    grid.close();
+    std::ofstream(dir.path() / (name + ".prj"))
+        << "GEOGCS[\"WGS 84\",DATUM[\"WGS_1984\",SPHEROID[\"WGS 84\",6378137,298.257223563]],PRIMEM[\"Greenwich\",0],"
+           "UNIT[\"degree\",0.0174532925199433]]";
+    const auto layer = dir.ingest_and_open({name, {raster}});
+    ASSERT_TRUE(layer);
+    for (const auto& [recipe_name, recipe] : fixed_recipes()) {
+      for (const int depth : {1, 3, 16}) {
+        const GroundRequest request{layer, recipe, 7, {layer->info().base_level + depth, 0, 0}};
+        const auto grounds = (*maker)->make(std::span(&request, 1));
+        ASSERT_TRUE(grounds[0]) << recipe_name << ", " << name << ": " << grounds[0].error().message;
+        const int posts = grounds[0]->posts;
+        const std::int64_t last = std::int64_t{4} << depth;
+        for (int n = 0; n < posts; ++n) {
+          const std::int64_t along = std::min<std::int64_t>(n, last);
+          const float expected = columns * rows == 1 ? 100 : 100 + std::ldexp(16.0F * static_cast<float>(along), -depth);
+          const std::size_t post = columns > 1 ? static_cast<std::size_t>(n) : static_cast<std::size_t>(n) * posts;
+          ASSERT_FLOAT_EQ(grounds[0]->heights_m[post], expected) << recipe_name << ", " << name << ", depth " << depth << ", post " << n;
+        }
+      }
     }
   }
 }
