@@ -3,13 +3,18 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <cstring>
 
 namespace lodestone {
 namespace {
 
 void count_provenance(Ground& ground) {
   ground.provenance_bits = 0;
-  for (const std::uint8_t p : ground.provenance) ground.provenance_bits |= static_cast<std::uint8_t>(1U << p);
+  for (const Provenance p : {kSurveyed, kFilled, kSynthetic}) {
+    if (std::memchr(ground.provenance.data(), p, ground.provenance.size()) != nullptr) {
+      ground.provenance_bits |= static_cast<std::uint8_t>(1U << p);
+    }
+  }
 }
 
 // Data cells of `pixels` (level 0, relative to the world's corner, mirrored beyond it) with a void corner as 255.

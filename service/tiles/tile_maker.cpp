@@ -1,8 +1,10 @@
 #include "service/tiles/tile_maker.h"
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <cmath>
+#include <tuple>
 
 #include "storage/formats/quantum.h"
 
@@ -10,6 +12,28 @@ namespace lodestone {
 namespace {
 
 using Clock = std::chrono::steady_clock;
+
+// In lanes, because the compiler may not reorder one running minimum of floats; std::minmax_element costs as much as the kernels.
+std::pair<float, float> lowest_and_highest(std::span<const float> heights_m) {
+  constexpr std::size_t kLanes = 16;
+  std::array<float, kLanes> lowest;
+  std::array<float, kLanes> highest;
+  lowest.fill(heights_m[0]);
+  highest.fill(heights_m[0]);
+  std::size_t n = 0;
+  for (; n + kLanes <= heights_m.size(); n += kLanes) {
+    for (std::size_t lane = 0; lane < kLanes; ++lane) {
+      const float h = heights_m[n + lane];
+      lowest[lane] = h < lowest[lane] ? h : lowest[lane];
+      highest[lane] = h > highest[lane] ? h : highest[lane];
+    }
+  }
+  for (; n < heights_m.size(); ++n) {
+    lowest[0] = std::min(lowest[0], heights_m[n]);
+    highest[0] = std::max(highest[0], heights_m[n]);
+  }
+  return {*std::min_element(lowest.begin(), lowest.end()), *std::max_element(highest.begin(), highest.end())};
+}
 
 double ms_since(Clock::time_point start) { return std::chrono::duration<double, std::milli>(Clock::now() - start).count(); }
 
@@ -106,9 +130,7 @@ TileAttributes tile_attributes(const TileKey& key, std::span<const float> height
   const int up = info.base_level - key.id.z;
   a.spacing_x = std::ldexp(std::hypot(info.transform[1], info.transform[4]), up);
   a.spacing_y = std::ldexp(std::hypot(info.transform[2], info.transform[5]), up);
-  const auto [lowest, highest] = std::minmax_element(heights_m.begin(), heights_m.end());
-  a.height_min_m = *lowest;
-  a.height_max_m = *highest;
+  std::tie(a.height_min_m, a.height_max_m) = lowest_and_highest(heights_m);
   return a;
 }
 
@@ -180,7 +202,8 @@ Result<TileMaker::Made> TileMaker::encode(const TileKey& key, Ground& ground) {
   tile->provenance = ground.provenance_bits;
   double highest = 0;
   if (key.format == TileFormat::kExr) {
-    for (const float h : ground.heights_m) highest = std::max(highest, std::abs(static_cast<double>(h)));
+    const auto [lowest_m, highest_m] = lowest_and_highest(ground.heights_m);
+    highest = std::max(std::abs(lowest_m), std::abs(highest_m));
   }
   tile->max_error_m = max_error_m(key, highest) + static_cast<float>(mesh_error_m);
   made.tile = std::move(tile);
